@@ -1,7 +1,7 @@
 """Which lines of kernels ran as plain Python? ``kernel_lines.py DATA`` reads what coverage.py measured in a test run.
 
-A kernel's line counts where the function is compiled: decorated with ``@kernel``, ``@direct`` or ``@built_in(...)``, or
-handed to one of these. Fails where under 95 % ran, where ``kernel_lines.toml`` has no reason for a
+A kernel's line counts where the function is compiled: decorated with ``@kernel`` or ``@built_in(...)``, or an argument
+of ``kernel`` or ``compile_signature``. Fails where under 95 % ran, where ``kernel_lines.toml`` has no reason for a
 kernel some of whose lines did not run, or where a reason there is out of date.
 """
 
@@ -20,8 +20,8 @@ FOLDERS = ("model", "sim", "policies", "oracle", "envs")
 """Subpackages of the core. All kernels that decide what a sender does are in these."""
 LEAST = 0.95
 """Share of lines that must run."""
-DECORATORS = {"kernel", "direct", "built_in"}
-CALLS = {"kernel", "direct", "compile_for"}
+DECORATORS = {"kernel", "built_in"}
+CALLS = {"kernel", "compile_signature"}
 HOOKS = {"on_arrival", "on_departure", "on_dequeue", "on_send", "function"}
 
 
@@ -42,18 +42,18 @@ def _compiles(call: ast.Call) -> bool:
 def kernels(source: str) -> Iterator[ast.FunctionDef]:
     """All functions of a module that Numba compiles."""
     nodes = list(ast.walk(ast.parse(source)))
-    handed: set[str] = set()
+    compiled: set[str] = set()
     for node in nodes:
         if isinstance(node, ast.Call) and (_called(node) in CALLS or _compiles(node)):
             values = [*node.args, *(word.value for word in node.keywords if word.arg in HOOKS)]
-            handed |= {value.id for value in values if isinstance(value, ast.Name)}
+            compiled |= {value.id for value in values if isinstance(value, ast.Name)}
     for node in nodes:
         if isinstance(node, ast.FunctionDef):
             marks = node.decorator_list
             decorated = any(
                 _called(mark) in DECORATORS or (isinstance(mark, ast.Call) and _compiles(mark)) for mark in marks
             )
-            if decorated or node.name in handed:
+            if decorated or node.name in compiled:
                 yield node
 
 

@@ -65,7 +65,7 @@ PROGRAMS = (
 """Python packages: ``ros2 launch``."""
 LINKED = "-Wl,--as-needed -Wl,--unresolved-symbols=ignore-in-shared-libs"
 """The wheels' libraries leave Python's symbols to the interpreter, and bring renamed copies of others."""
-MENDED = (
+FIXES = (
     ("**/*.cmake", r"/opt/python/[^;\"]+", sysconfig.get_path("include")),
     ("**/*.cmake", r"/usr/lib64/libtinyxml2\.so", "tinyxml2"),
     ("tracetools/cmake/*.cmake", r"lttng-ust;", ""),
@@ -114,7 +114,7 @@ def attempt(*words: object) -> None:
 
 def mend() -> None:
     """Take what only the wheels' own machine has out of their CMake files."""
-    for pattern, old, new in MENDED:
+    for pattern, old, new in FIXES:
         for file in (ENVIRONMENT / "share").glob(pattern):
             text = file.read_text(encoding="utf-8")
             file.write_text(re.sub(old, new, text), encoding="utf-8")

@@ -166,7 +166,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
     servers = ["packages/live/tests"]
     # Named, as pytest ignores no folder that pyproject.toml names.
     others = ["tests", "packages/papers/tests", "agents", "studies", "website", "--ignore=tests/fuzz"]
-    # Of the tests for the night, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.
+    # Of the nightly tests, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.
     plain = ["-m", "kernels or not nightly", *others, *arguments]
     report = [PYTHON, "-m", "coverage", "report", "--skip-covered", "--include=bufgym/*"]
     sample = [".ci/mutants", "--sample=150", "--minutes=12", f"--seed={time.strftime('%Y%m%d')}"]

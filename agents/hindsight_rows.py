@@ -14,7 +14,7 @@ from torch import Tensor
 from agents.mixed_env import Cell
 from bufgym.envs.expert.player import Player, as_actions
 from bufgym.envs.options import Options
-from bufgym.envs.rows import Rows
+from bufgym.envs.sub_envs import SubEnvs
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.policies.candidate_network import inputs
 from bufgym.policies.ruled_network import NOT_OFFERED, seen, watcher
@@ -82,19 +82,19 @@ class TaughtRows:
             options = Options(
                 capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="none"
             )
-            rows = Rows(part.rows, part.cell.scenario, options)
-            self.groups.append(rows)
+            sub_envs = SubEnvs(part.rows, part.cell.scenario, options)
+            self.groups.append(sub_envs)
             self._players.append(Player(watcher(candidates), part.rows))
-            self._teachers.append(None if part.stays else Hindsight(rows.senders, "train.py hindsight"))
+            self._teachers.append(None if part.stays else Hindsight(sub_envs.senders, "train.py hindsight"))
         self._ruled = np.concatenate([np.arange(size) < max(size // RULED, size > 1) for size in sizes])
         self._candidates = candidates
         self.seen = np.zeros((self.n, seen(candidates) if ruled else inputs(candidates)), np.float32)
         self.decisions = np.zeros((self.n, candidates + 2 + ruled), np.int64)
         """int64[n, actions]: the slot action that each action stands for, ``NOT_OFFERED`` where it is not offered."""
-        for rows in self.groups:
-            for i in range(len(rows)):
-                rows.seed(i, seeding.np_random(int(rng.integers(2**31)))[0])
-            rows.reset(np.arange(len(rows)))
+        for sub_envs in self.groups:
+            for i in range(len(sub_envs)):
+                sub_envs.seed(i, seeding.np_random(int(rng.integers(2**31)))[0])
+            sub_envs.reset(np.arange(len(sub_envs)))
         self._observe()
 
     @property
@@ -104,17 +104,17 @@ class TaughtRows:
 
     def _observe(self) -> None:
         actions, numbers, k = self.decisions.shape[1], self.seen.shape[1], self._candidates
-        for rows, span, player in zip(self.groups, self.spans, self._players, strict=True):
-            player.actions(rows.senders)
+        for sub_envs, span, player in zip(self.groups, self.spans, self._players, strict=True):
+            player.actions(sub_envs.senders)
             end = player.memory[:, player.memory.shape[1] - (k + 3) - seen(k) :]
             self.seen[span], answers = end[:, k + 3 : k + 3 + numbers], end[:, :actions].astype(np.int64)
-            self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, as_actions(answers, rows.capacity))
+            self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, as_actions(answers, sub_envs.capacity))
 
     def _act(self, decisions: NDArray[np.int64]) -> None:
-        for rows, span in zip(self.groups, self.spans, strict=True):
-            rows.step(decisions[span])
-            if rows.output.terminated.any():
-                rows.reset(np.flatnonzero(rows.output.terminated))
+        for sub_envs, span in zip(self.groups, self.spans, strict=True):
+            sub_envs.step(decisions[span])
+            if sub_envs.output.terminated.any():
+                sub_envs.reset(np.flatnonzero(sub_envs.output.terminated))
         self._observe()
 
     def _by_rule(self) -> NDArray[np.int64]:
@@ -123,15 +123,15 @@ class TaughtRows:
 
     def scatter(self, rng: np.random.Generator) -> None:
         """Let the rule play until rows are at different moments of their episodes."""
-        longest = [min(rows.scenario.max_messages, LONGEST) for rows in self.groups]
-        begin = [rng.integers(steps, size=len(rows)) for rows, steps in zip(self.groups, longest, strict=True)]
+        longest = [min(sub_envs.scenario.max_messages, LONGEST) for sub_envs in self.groups]
+        begin = [rng.integers(steps, size=len(sub_envs)) for sub_envs, steps in zip(self.groups, longest, strict=True)]
         for moment in range(max(longest)):
             decisions = self._by_rule()
-            for rows, span, at in zip(self.groups, self.spans, begin, strict=True):
-                rows.step(decisions[span])
-                again = rows.output.terminated | (at == moment)
+            for sub_envs, span, at in zip(self.groups, self.spans, begin, strict=True):
+                sub_envs.step(decisions[span])
+                again = sub_envs.output.terminated | (at == moment)
                 if again.any():
-                    rows.reset(np.flatnonzero(again))
+                    sub_envs.reset(np.flatnonzero(again))
             self._observe()
 
     def step(self, choose: Choose) -> Lesson:

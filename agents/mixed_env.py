@@ -67,7 +67,7 @@ class MixedEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
         observed = []
         for group, span in zip(self.groups, self._spans, strict=True):
             seen: Any = group.reset(seed=None if seeds is None else list(seeds[span]))[0]
-            longest, rng = group.rows.scenario.max_messages, group.np_random[0]
+            longest, rng = group.sub_envs.scenario.max_messages, group.np_random[0]
             entries = rng.integers(longest, size=group.num_envs)
             for step in range(int(entries.max()) + 1):
                 if (entries == step).any():

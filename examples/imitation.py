@@ -84,7 +84,7 @@ class Pupil:
             actions="slots",
         )
         self.envs.reset(seed=settings.seed)
-        self.rows = self.envs.unwrapped.rows
+        self.sub_envs = self.envs.unwrapped.sub_envs
         self.judge = expert.clairvoyant(self.envs)
         self.rng = np.random.default_rng(settings.seed)
         spaces = self.envs.single_observation_space, self.envs.single_action_space
@@ -92,14 +92,14 @@ class Pupil:
 
     def log_p(self, seen: np.ndarray, mask: np.ndarray) -> torch.Tensor:
         """Log-probability of each action, [n, L + 2]; invalid actions have probability 0."""
-        observation = {name: torch.from_numpy(array) for name, array in self.rows.form.of(seen).items()}
+        observation = {name: torch.from_numpy(array) for name, array in self.sub_envs.form.of(seen).items()}
         return self.network.get_distribution(observation, mask).distribution.logits
 
     def play(self, first: bool) -> States:
         """Play an episode in each row; ``first`` plays half of them by the clairvoyant and half at random."""
         states = []
-        for _ in range(self.rows.scenario.max_messages):
-            output = self.rows.output
+        for _ in range(self.sub_envs.scenario.max_messages):
+            output = self.sub_envs.output
             seen, mask, regrets = output.flat.copy(), output.action_mask.copy(), self.judge.regrets()
             if first:
                 drawn = np.argmax(self.rng.random(mask.shape) * mask, axis=1)

@@ -148,7 +148,7 @@ class Reproduction(Figure):
                     time.sleep(2)
                     viewer = threading.Thread(target=look)
                     viewer.start()
-                    carrier.tell(time.monotonic() + 2)
+                    carrier.send(time.monotonic() + 2)
                     own = where if policy == "stock" else {**where, **loaded}
                     subprocess.run(words, env=own, stderr=subprocess.DEVNULL, check=True, timeout=200, **near)
                     viewer.join()

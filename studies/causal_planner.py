@@ -68,7 +68,7 @@ class Planning:
     """Number of futures."""
     horizon_s: float
     """How far they reach, s: the planner supposes that the stream ends there."""
-    told: bool
+    knows_end: bool
     """Whether the planner knows when the stream ends, as whoever counts arrivals of this scenario does."""
 
 
@@ -122,7 +122,7 @@ class CausalPlanner:
         """Draw futures, and find the clairvoyant's gains in each."""
         n, size, now_us = self._planning.futures, int(arrival.size_bytes), int(arrival.arrival_us)
         left = round(self._planning.horizon_s * self._scenario.rate_hz)
-        if self._planning.told:
+        if self._planning.knows_end:
             left = min(left, self._scenario.max_messages - 1 - int(arrival.seq))
         near = min(KEPT, left)
         steps = np.concatenate([np.arange(near + 1), np.arange(near + self._stride, left + 1, self._stride)])

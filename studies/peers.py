@@ -111,10 +111,10 @@ def _profile_batch(id: str, capacity: int, sizes: Sizes) -> str:
     n = max(sizes.batches)
     vector: Any = gym.make_vec(id, n, vectorization_mode=NATIVE, capacity=capacity)
     actions, decisions = record(vector, sizes.steps(n))
-    rows = vector.unwrapped.rows
-    best = _parts_s(sizes.repeats, rows, ("step", "reset"), vector.reset, lambda: play(vector, actions))
+    sub_envs = vector.unwrapped.sub_envs
+    best = _parts_s(sizes.repeats, sub_envs, ("step", "reset"), vector.reset, lambda: play(vector, actions))
     whole, in_kernel, in_reset = (seconds / decisions * 1e9 for seconds in best)
-    batch, output = rows.senders.batch, rows.output
+    batch, output = sub_envs.senders.batch, sub_envs.output
     asks = max(1, int((batch.senders["waiting"] != NOTHING_WAITS).sum()))
 
     def written(kernel: Callable[..., None]) -> float:
@@ -142,9 +142,9 @@ def _profile_batch(id: str, capacity: int, sizes: Sizes) -> str:
 
 def _profile_single(id: str, sizes: Sizes) -> str:
     env: Any = gym.make(id, capacity=sizes.capacity).unwrapped
-    reject, rows, names = sizes.capacity, env.rows, ("step", "observation", "info", "reset")
+    reject, sub_envs, names = sizes.capacity, env.sub_envs, ("step", "observation", "info", "reset")
     game = partial(play, env, [reject] * sizes.single_steps, True)
-    best = _parts_s(sizes.repeats, rows, names, env.reset, game)
+    best = _parts_s(sizes.repeats, sub_envs, names, env.reset, game)
     whole, stepping, observing, informing, beginning = (seconds / sizes.single_steps * 1e9 for seconds in best)
     parts = {
         "handing the kernel its arrays, and the kernel": stepping,

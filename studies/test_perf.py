@@ -56,7 +56,10 @@ def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
     for k in range(40):
         flat, _, ended, _, info = env.step(5 if info["action_mask"][5] else k % 4)
         assert not ended
-    buffer, arrival = python_view(named(env.rows.senders.batch), 0), python_arrival(named(env.rows.senders.batch), 0)
+    buffer, arrival = (
+        python_view(named(env.sub_envs.senders.batch), 0),
+        python_arrival(named(env.sub_envs.senders.batch), 0),
+    )
     bare, s = microbenchmark.Bare.new(1, 4), len(buffer.slots)
     at_s, x, size, gain = bare.places[0]
     zero = buffer.dequeued_arrival_us

@@ -196,12 +196,12 @@ ROWS = {
         {},
         {
             "bufgym/envs/options.py": ("    bound: bool", "    sloth: int = 0\n    bound: bool"),
-            "bufgym/envs/rows.py": (
+            "bufgym/envs/sub_envs.py": (
                 "        self._own_fields =",
                 "        self.sloth = options.sloth\n        self._own_fields =",
             ),
         },
-        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.rows.sloth == 3",
+        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.sub_envs.sloth == 3",
     ),
     "a trace format": Addition(
         {},

@@ -94,7 +94,7 @@ def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: py
 def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
     learner: Any = learner_of(BY_PPO)
     env: Any = learner.env(Path())
-    assert env.num_envs == 4 and env.envs.rows.capacity == 4  # two cells of two robots, at the middle L
+    assert env.num_envs == 4 and env.envs.sub_envs.capacity == 4  # two cells of two robots, at the middle L
     train.main(BY_PPO)
     folder = Path("runs/tiny")
     rows = read_rows(folder / "rows.csv", TASK.layout)

@@ -130,7 +130,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
     first, second = lengths(), lengths()
     envs.seed(3)
     assert (lengths(), lengths()) == (first, second)
-    scenario = envs.get_attr("rows")[0].scenario
+    scenario = envs.get_attr("sub_envs")[0].scenario
     envs.set_options({"episodes": [scenario.episode(4), scenario.episode(9)]})
     assert lengths() == [6, 11]  # T and the two messages around the interruption
     refuse("not a list", envs.set_options, [{}, {}])
@@ -211,12 +211,12 @@ def reached(policy: Any) -> list[Any]:
 def reached_in_env(model: Any, form: str, fields: Any = None, acts: str = "slots") -> list[Any]:
     envs = SenderVectorEnv(4, SCENARIO, L, decide_at="arrival", actions=acts, fields=fields, observation=form)
     envs.reset(options={"episodes": EPISODES})
-    rows = envs.rows
-    while not rows.output.terminated.all():
-        observation: Any = rows.observation()
-        masks = {"action_masks": rows.output.action_mask} if isinstance(model, MaskablePPO) else {}
-        rows.step(rows.actions(model.predict(observation, deterministic=True, **masks)[0]))
-    return [outcome(rows.senders, i) for i in range(4)]
+    sub_envs = envs.sub_envs
+    while not sub_envs.output.terminated.all():
+        observation: Any = sub_envs.observation()
+        masks = {"action_masks": sub_envs.output.action_mask} if isinstance(model, MaskablePPO) else {}
+        sub_envs.step(sub_envs.actions(model.predict(observation, deterministic=True, **masks)[0]))
+    return [outcome(sub_envs.senders, i) for i in range(4)]
 
 
 @pytest.mark.parametrize("network", ["MultiInputPolicy", "MlpPolicy"])
@@ -285,14 +285,14 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
     episode = draw(client, 0)
     envs = SenderVectorEnv(1, client, 6, observation=form)
     envs.reset(options={"episodes": [episode]})
-    rows = envs.rows
-    while not rows.output.terminated.all():
-        action, _ = model.predict(rows.observation(), deterministic=True, action_masks=rows.output.action_mask)
-        rows.step(np.asarray(action, np.int64))
+    sub_envs = envs.sub_envs
+    while not sub_envs.output.terminated.all():
+        action, _ = model.predict(sub_envs.observation(), deterministic=True, action_masks=sub_envs.output.action_mask)
+        sub_envs.step(np.asarray(action, np.int64))
     senders = run(policy, [episode], 6, client.value, topics=client.topics)
     for name in ("rejected", "evicted", "transmitted"):
-        assert senders.batch.senders[name][0] == rows.senders.batch.senders[name][0]
-    assert np.array_equal(senders.batch.log["dropped_us"][0], rows.senders.batch.log["dropped_us"][0])
+        assert senders.batch.senders[name][0] == sub_envs.senders.batch.senders[name][0]
+    assert np.array_equal(senders.batch.log["dropped_us"][0], sub_envs.senders.batch.log["dropped_us"][0])
 
 
 def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:

@@ -56,11 +56,11 @@ def in_environment(model: Any, scenario: Any, episodes: Any, L: int, **options: 
     """The senders after the model has played these episodes in the environment, without a policy."""
     envs = SenderVectorEnv(len(episodes), scenario, L, **options)
     envs.reset(options={"episodes": episodes})
-    rows = envs.rows
-    while not rows.output.terminated.all():
-        masks = {"action_masks": rows.output.action_mask} if isinstance(model, MaskablePPO) else {}
-        rows.step(rows.actions(model.predict(rows.observation(), deterministic=True, **masks)[0]))
-    return rows.senders
+    sub_envs = envs.sub_envs
+    while not sub_envs.output.terminated.all():
+        masks = {"action_masks": sub_envs.output.action_mask} if isinstance(model, MaskablePPO) else {}
+        sub_envs.step(sub_envs.actions(model.predict(sub_envs.observation(), deterministic=True, **masks)[0]))
+    return sub_envs.senders
 
 
 def assert_same(

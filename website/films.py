@@ -114,7 +114,7 @@ def _topics() -> Frames:
 def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
     """Images of ``bufgym/Topics-v0`` at even times while this policy plays."""
     env = SenderEnv("topics", 32, duration_s=20.0, render_mode="rgb_array", info="none")
-    senders, player = env.rows.senders, Player(policies.get(name))
+    senders, player = env.sub_envs.senders, Player(policies.get(name))
     env.reset(options={"episode": episode})
     times_us = np.linspace(0, int(episode.arrivals["arrival_us"][-1]), _COUNT + 1)[1:].tolist()
     pictures: list[NDArray[np.uint8]] = []
@@ -142,14 +142,14 @@ def _rendered_cell(name: str) -> tuple[str, list[NDArray[np.uint8]]]:
 
     env = parallel_env(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="none", render_mode="rgb_array")
     env.reset(seed=1)
-    player, senders, ticks = Player(policies.get(name), 8), env.rows.senders, 12 * 30
+    player, senders, ticks = Player(policies.get(name), 8), env.sub_envs.senders, 12 * 30
     shown = set(np.linspace(ticks / _COUNT, ticks, _COUNT).astype(int).tolist())
     pictures = []
     for tick in range(1, ticks + 1):
         env.step({agent: player.action(senders, i) for i, agent in enumerate(env.agents)})
         if tick in shown:
             pictures.append(env.render())
-    h = float(env.rows.summary(slice(None))["qoi"].mean())
+    h = float(env.sub_envs.summary(slice(None))["qoi"].mean())
     return f"{name}: H = {h:.2f} in the end, mean over the robots", pictures
 
 

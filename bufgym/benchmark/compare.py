@@ -222,7 +222,7 @@ def _compare_on_suite(
     out: str | Path | None,
     **how: Any,
 ) -> Comparison:
-    """Run the policies by name in the suite's processes, read the summary of the run's folder, and render it."""
+    """Run the policies in the suite's processes, read the summary of the run's folder, and render it."""
     if frozen := [name for name in how if name not in (*OF_A_SUITE, "form", "progress")]:
         raise BufgymError(f"{', '.join(frozen)}: a suite's episodes are frozen")
     if seeds is not None and not isinstance(seeds, int):
@@ -235,8 +235,7 @@ def _compare_on_suite(
             rule = "register it to run it on a suite, whose processes know it by name"
             raise BufgymError(f"policy {policy.name}: {rule}")
     of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
-    names = tuple(policy.name for policy in players)
-    sweep = Sweep(suite, names, capacities=capacities, seeds=seeds, **of_the_sweep)
+    sweep = Sweep(suite, tuple(players), capacities=capacities, seeds=seeds, **of_the_sweep)
     # Other processes can't know what a user's own code registered in this one.
     if sweep.policy_file is None and not all(policy.built_in or sources.loaded([policy.name]) for policy in players):
         how["jobs"] = 1

@@ -28,6 +28,7 @@ from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import check_distinct, run
 from bufgym.benchmark.table import unranked_among
 from bufgym.benchmark.tasks import Task
+from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
 from bufgym.scenario.registry import with_parameters
@@ -45,9 +46,9 @@ class Sweep:
     """Settings of a suite's benchmark."""
 
     suite: str
-    specs: tuple[str, ...]
-    """Policies, as ``bufgym.policies.get`` takes them; the task's baseline and reference, which rows are compared
-    with, are added if they are missing."""
+    specs: tuple[str | Policy, ...]
+    """Policies, as ``bufgym.policies.get`` takes them; other processes get them by name. The task's baseline and
+    reference, which rows are compared with, are added if they are missing."""
     split: str = "test"  # "train", "validation" or "test"
     capacities: tuple[int, ...] = ()  # L, messages; empty for the suite's own
     seeds: int | None = None  # episodes on each trace; None for the suite's own number
@@ -63,8 +64,12 @@ class Sweep:
     def task(self) -> Task:
         return tasks.task_of(self.suite)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A policy's functions may be of a module that only its file or source defines, so its name is pickled.
+        return {**vars(self), "specs": tuple(policy.name for policy in self.policies)}
+
     @property
-    def policies(self) -> list[policies.Policy]:
+    def policies(self) -> list[Policy]:
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
@@ -95,9 +100,10 @@ class Sweep:
             raise BufgymError(f"seeds = {seeds}: must lie between 1 and {SEEDS_PER_TRACE}")
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
-        compared = dict.fromkeys((task.baseline, task.reference))
-        specs = (*self.specs, *(name for name in compared if name not in self.specs))
-        files = self.sources or sources.loaded(specs, self.home)
+        given, compared = self.policies, dict.fromkeys((task.baseline, task.reference))
+        names = [policy.name for policy in given]
+        specs = (*given, *(policies.get(name) for name in compared if name not in names))
+        files = self.sources or sources.loaded(names, self.home)
         complete = replace(
             self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
         )

@@ -56,7 +56,7 @@ def play(
     mode = "ansi" if out is None else "rgb_array"
     world: Any = gymnasium.make(id, capacity=capacity, render_mode=mode, actions="slots").unwrapped
     player = Player(policy)
-    world.reset(options={"episode": draw(world.rows.scenario, seed)})
+    world.reset(options={"episode": draw(world.sub_envs.scenario, seed)})
     # On a terminal each picture replaces the one before, unless the user wants no escape codes (no-color.org).
     plain = not sys.stdout.isatty() or bool(os.environ.get("NO_COLOR"))
     clear = "" if plain else "\x1b[H\x1b[J"
@@ -75,8 +75,8 @@ def play(
         if speed and film is None:
             time.sleep(1 / speed)
         # An episode that asks for no decision ends with its first step, whatever the action.
-        due = world.rows.senders.batch.senders[0]["waiting"] != 0
-        _, _, ended, _, info = world.step(player.action(world.rows.senders, 0) if due else capacity)
+        due = world.sub_envs.senders.batch.senders[0]["waiting"] != 0
+        _, _, ended, _, info = world.step(player.action(world.sub_envs.senders, 0) if due else capacity)
         if ended:
             show("")
             end = f"over: QoI {info['qoi']:.3f}, {info['delivered']} of {info['arrived']} delivered,"

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from bufgym import oracle  # noqa: F401  (registers the clairvoyant as a policy that can play here)
-from bufgym.envs.fleet_rows import FleetVecEnv
+from bufgym.envs.fleet_sub_envs import FleetVecEnv
 from bufgym.envs.single import SenderEnv
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.utils.modules import on_demand

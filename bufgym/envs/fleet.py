@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.fleet_rows import fleet_rows
+from bufgym.envs.fleet_sub_envs import fleet_sub_envs
 from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options
 from bufgym.scenario import FleetScenario, Uplink
@@ -72,19 +72,19 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         capacity: int = Options.capacity,
         **arguments: Any,
     ) -> None:
-        self.rows = fleet_rows(1, FleetScenario.of(robots, scenario), capacity=capacity, **arguments)
-        self.render_mode = self.rows.options.render_mode
-        self._window = self.rows.options.window()
-        self.possible_agents = [f"robot_{i}" for i in range(len(self.rows))]
+        self.sub_envs = fleet_sub_envs(1, FleetScenario.of(robots, scenario), capacity=capacity, **arguments)
+        self.render_mode = self.sub_envs.options.render_mode
+        self._window = self.sub_envs.options.window()
+        self.possible_agents = [f"robot_{i}" for i in range(len(self.sub_envs))]
         self.agents: list[str] = []
         self.np_random, _ = seeding.np_random()
         # PettingZoo seeds an agent by seeding its spaces, so each agent has its own.
-        one = self.rows.observation_space
+        one = self.sub_envs.observation_space
         self.observation_spaces: Spaces = {agent: copy.deepcopy(one) for agent in self.possible_agents}
-        actions = self.rows.capacity + 2
+        actions = self.sub_envs.capacity + 2
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
         self.state_space = spaces.Box(0.0, 1.0, self.state().shape, np.float32)
-        self._actions = np.zeros(len(self.rows), np.int64)
+        self._actions = np.zeros(len(self.sub_envs), np.int64)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         return self.observation_spaces[agent]
@@ -95,12 +95,12 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], Infos]:
-        rows = self.rows
+        sub_envs = self.sub_envs
         if seed is not None:
             self.np_random, _ = seeding.np_random(seed)
-        if seed is not None or rows.streams[0] is None:
-            rows.seed(0, self.np_random)
-        rows.reset(np.arange(len(rows)), [(options or {}).get("episode")])
+        if seed is not None or sub_envs.streams[0] is None:
+            sub_envs.seed(0, self.np_random)
+        sub_envs.reset(np.arange(len(sub_envs)), [(options or {}).get("episode")])
         self.agents = list(self.possible_agents)
         if self._window is not None:
             self.render()
@@ -109,23 +109,23 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     def step(
         self, actions: Mapping[str, int]
     ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        rows, agents = self.rows, self.agents
+        sub_envs, agents = self.sub_envs, self.agents
         if not agents:
             raise gym.error.ResetNeeded("call reset() before step()")
         for i, agent in enumerate(agents):
             action = actions.get(agent)
             if action is None:
                 raise BufgymError(f"actions: none for {agent!r}; every robot decides at every tick")
-            self._actions[i] = rows.action(f"actions[{agent!r}]", action)
-        rows.step(self._actions)
-        terminated = bool(rows.output.terminated[0])
+            self._actions[i] = sub_envs.action(f"actions[{agent!r}]", action)
+        sub_envs.step(self._actions)
+        terminated = bool(sub_envs.output.terminated[0])
         if terminated:
             self.agents = []
         if self._window is not None:
             self.render()
         return (
             self._observations(),
-            dict(zip(agents, rows.rewards().tolist(), strict=True)),
+            dict(zip(agents, sub_envs.rewards().tolist(), strict=True)),
             dict.fromkeys(agents, terminated),
             dict.fromkeys(agents, False),
             self._infos(terminated),
@@ -133,7 +133,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     def state(self) -> NDArray[np.float32]:
         """float32[N x fields]: robot by robot, all slot fields of the tables, then all context fields."""
-        return self.rows.output.flat[:, : self.rows.form.table_numbers].flatten()
+        return self.sub_envs.output.flat[:, : self.sub_envs.form.table_numbers].flatten()
 
     def render(self) -> Any:
         """A line for each robot with its buffer and the fate of its messages, as text or as uint8[400, 800, 3].
@@ -145,12 +145,12 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
                 "render() needs a render_mode: parallel_env(..., render_mode='ansi', 'rgb_array' or 'human')"
             )
             return None
-        if self.rows.senders.episodes[0] is None:
+        if self.sub_envs.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before render()")
         from bufgym.envs.render import cell  # loaded only to draw
 
         draw = cell.cell_ansi if self.render_mode == "ansi" else cell.cell_rgb_array
-        drawn: Any = draw(self.rows, self.possible_agents)
+        drawn: Any = draw(self.sub_envs, self.possible_agents)
         return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
 
     def close(self) -> None:
@@ -159,10 +159,10 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
             self._window.close()
 
     def _observations(self) -> dict[str, Observation]:
-        return {agent: self.rows.observation(i) for i, agent in enumerate(self.possible_agents)}
+        return {agent: self.sub_envs.observation(i) for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, terminated: bool) -> Infos:
-        return {agent: self.rows.info(i, terminated) for i, agent in enumerate(self.possible_agents)}
+        return {agent: self.sub_envs.info(i, terminated) for i, agent in enumerate(self.possible_agents)}
 
 
 parallel_env = FleetEnv

@@ -189,8 +189,9 @@ class BufferPool(Generic[Buffers]):
     """Arrays for results, used again once the caller has let go of them, so that a step allocates nothing.
 
     Python counts the references to an array. As long as there are more to one of the arrays, or to a view of it, than
-    when it was made, the caller holds it, and it is not written again. Without the pool a step of the single
-    environment takes 9.4 us in place of 4.5, and one of 64 rows 25 us in place of 12.
+    when it was made, the caller holds it, and it is not written again. Without the pool a step of 64 environments takes
+    50 us in place of 36 with candidates, and 88 in place of 42 with slots. One environment with slots takes 14 us in
+    place of 5.4; with candidates its 27 numbers are copied, which takes no pool.
     """
 
     def __init__(self, make: Callable[[], tuple[Buffers, Sequence[NDArray[Any]]]]) -> None:

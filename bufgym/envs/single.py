@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
-from bufgym.envs.rows import NUMBERED, Rows, check_entries
+from bufgym.envs.sub_envs import NUMBERED, SubEnvs, check_entries
 from bufgym.scenario import Scenario
 from bufgym.utils.errors import BufgymError
 
@@ -135,13 +135,13 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     _spec: EnvSpec | None = None
 
     def __init__(self, scenario: str | Scenario = "lte", capacity: int = Options.capacity, **arguments: Any) -> None:
-        self.rows = Rows(1, *read_arguments(scenario, capacity=capacity, **arguments))
-        self.render_mode = self.rows.options.render_mode
-        self._window = self.rows.options.window()
-        self.observation_space = self.rows.observation_space
-        self.action_space = self.rows.action_space
+        self.sub_envs = SubEnvs(1, *read_arguments(scenario, capacity=capacity, **arguments))
+        self.render_mode = self.sub_envs.options.render_mode
+        self._window = self.sub_envs.options.window()
+        self.observation_space = self.sub_envs.observation_space
+        self.action_space = self.sub_envs.action_space
         self._action = np.zeros(1, np.int64)
-        self.rows.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
+        self.sub_envs.output.terminated[0] = True  # kept with the other arrays, so a snapshot of them has it
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -153,41 +153,41 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec and replace(spec, max_episode_steps=self.rows.unreached_steps)
+        self._spec = spec and replace(spec, max_episode_steps=self.sub_envs.unreached_steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         super().reset(seed=seed)
-        if seed is not None or self.rows.streams[0] is None:
-            self.rows.seed(0, self.np_random)
+        if seed is not None or self.sub_envs.streams[0] is None:
+            self.sub_envs.seed(0, self.np_random)
         options = options or {}
         check_entries(options, ("episode", *NUMBERED), "options")
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")
-        self.rows.reset(_ROW, [options.get("episode", options or None)])
-        self.rows.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
+        self.sub_envs.reset(_ROW, [options.get("episode", options or None)])
+        self.sub_envs.output.terminated[0] = False  # also if no arrival asks: the first step then ends the episode
         if self._window is not None:
             self.render()
-        return self.rows.observation(0), self.rows.info(0, False)
+        return self.sub_envs.observation(0), self.sub_envs.info(0, False)
 
     def step(
         self, action: np.int64 | int | NDArray[np.floating[Any]]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        rows, terminated = self.rows, self.rows.output.terminated
+        sub_envs, terminated = self.sub_envs, self.sub_envs.output.terminated
         if terminated.item():
-            why = "" if rows.senders.episodes[0] is None else "the episode has ended: "
+            why = "" if sub_envs.senders.episodes[0] is None else "the episode has ended: "
             raise gym.error.ResetNeeded(f"{why}call reset() before step()")
-        self._action[0] = rows.action("action", action)
-        rows.step(self._action)
+        self._action[0] = sub_envs.action("action", action)
+        sub_envs.step(self._action)
         ended = terminated.item()
         if self._window is not None:
             self.render()
-        return rows.observation(0), rows.rewards().item(), ended, False, rows.info(0, ended)
+        return sub_envs.observation(0), sub_envs.rewards().item(), ended, False, sub_envs.info(0, ended)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """bool[actions]: the actions valid now, under the name that sb3-contrib looks for."""
-        return cast(NDArray[np.bool_], self.rows.action_masks()[0])
+        return cast(NDArray[np.bool_], self.sub_envs.action_masks()[0])
 
     def render(self) -> Any:
         """Kept and dropped messages as a timeline against the link's capacity: text, or uint8[400, 800, 3].
@@ -199,7 +199,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
             return None
         from bufgym.envs import render  # loaded only to draw
 
-        drawn = render.draw(self.rows.senders, 0, self.render_mode, self.rows.output.slot_actions[0])
+        drawn = render.draw(self.sub_envs.senders, 0, self.render_mode, self.sub_envs.output.slot_actions[0])
         return drawn if self._window is None else self._window.show([drawn], self.metadata["render_fps"])
 
     def close(self) -> None:

@@ -12,36 +12,36 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import BufferPool, Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
-from bufgym.envs.rows import Rows, check_entries
+from bufgym.envs.sub_envs import SubEnvs, check_entries
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
 from bufgym.utils.errors import BufgymError
 
 
 class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
-    """A batch of ``SenderEnv``: the same actions, observations, rewards, episode ends and arguments, row by row.
+    """A batch of n ``SenderEnv``, each with the same actions, observations, rewards, episode ends and arguments.
 
     With candidates, the default of one queue, actions are int64[n] and observations float32[n, 27]. With slots, an
-    observation is a dict of arrays. With several topics some rows may ask what to drop and others what to send: the
-    field ``socket_asks`` tells them apart.
+    observation is a dict of arrays. With several topics some environments may ask what to drop and others what to
+    send: the field ``socket_asks`` tells them apart.
 
-    ``num_envs``: n, rows. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
+    ``num_envs``: n. ``max_episode_steps`` truncates episodes, as Gymnasium's ``TimeLimit`` does.
     ``autoreset_mode``: one of Gymnasium's, or its value or name ("SameStep", "SAME_STEP").
-    ``num_threads``: threads that share the rows of a step, by default 1; they do not change results. ``arguments``: the
-    others of ``SenderEnv``.
+    ``num_threads``: threads that share the environments of a step, by default 1; they do not change results.
+    ``arguments``: the others of ``SenderEnv``.
 
-    ``reset(seed=s)`` seeds row i with s + i, as Gymnasium's own vector environments do. A sequence seeds row by row.
-    ``reset`` takes two options. ``reset_mask``, bool[n], selects rows. ``episodes`` has an entry for each row: an
-    ``Episode``, a dict of the options that name one in ``SenderEnv``, or None to draw the next.
+    ``reset(seed=s)`` seeds environment i with s + i, as Gymnasium's own vector environments do. A sequence has a seed
+    for each. ``reset`` takes two options. ``reset_mask``, bool[n], selects environments. ``episodes`` has an entry for
+    each: an ``Episode``, a dict of the options that name one in ``SenderEnv``, or None to draw the next.
 
     ``info`` has Gymnasium's form:
 
     - ``action_mask`` int8[n, actions], and ``slots`` int64[n, actions] of candidates,
     - ``qoi`` float64[n], ``invalid`` int64[n], and ``reward_terms`` by name, float64[n] each.
 
-    Rows that end, truncated ones too, have their summary. With SAME_STEP autoreset ``info`` also has ``final_obs`` and
-    ``final_info`` for the rows that ended, marked in ``info["_final_obs"]``. Arrays from a step are never written again
-    while anyone holds them.
+    Environments that end, truncated ones too, have their summary. With SAME_STEP autoreset ``info`` also has
+    ``final_obs`` and ``final_info`` for those that ended, marked in ``info["_final_obs"]``. Arrays from a step are
+    never written again while anyone holds them.
     """
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10, "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -56,45 +56,45 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ) -> None:
-        rows = self._make_rows(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
+        sub_envs = self._make_sub_envs(whole("num_envs", num_envs, 1), scenario, capacity=capacity, **arguments)
         if max_episode_steps is not None:
             whole("max_episode_steps", max_episode_steps, 1)
-        if rows.options.info == "summary":
+        if sub_envs.options.info == "summary":
             raise BufgymError("info = 'summary': is for recorders of a single environment; a batch has 'full'")
         modes = {text: mode for mode in AutoresetMode for text in (mode, mode.value, mode.name)}
         if autoreset_mode not in list(modes):
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise BufgymError(f"autoreset_mode = {autoreset_mode!r}: must be one of {known}")
         self.autoreset_mode = modes[autoreset_mode]
-        self.render_mode = rows.options.render_mode
-        self._window = rows.options.window()
+        self.render_mode = sub_envs.options.render_mode
+        self._window = sub_envs.options.window()
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.rows, self.num_envs = rows, len(rows)
+        self.sub_envs, self.num_envs = sub_envs, len(sub_envs)
         self.max_episode_steps = max_episode_steps
-        self.single_observation_space = rows.observation_space
-        self.single_action_space = rows.action_space
+        self.single_observation_space = sub_envs.observation_space
+        self.single_action_space = sub_envs.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._steps = np.zeros(self.num_envs, np.int64)
         self._done, self._any_done = np.zeros(self.num_envs, np.bool_), False
-        self._every_row = np.ones(self.num_envs, np.bool_)
+        self._every = np.ones(self.num_envs, np.bool_)
         self._buffers = BufferPool(self._new_buffers)
         self._renew_output()
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs
         self._seeds: list[int] = [-1] * self.num_envs
 
-    def _make_rows(self, n: int, scenario: Any, **arguments: Any) -> Rows:
-        return Rows(n, *read_arguments(scenario, **arguments))
+    def _make_sub_envs(self, n: int, scenario: Any, **arguments: Any) -> SubEnvs:
+        return SubEnvs(n, *read_arguments(scenario, **arguments))
 
     @property  # type: ignore[misc]
     def np_random(self) -> Any:
-        """Each row's generator, as in Gymnasium's ``SyncVectorEnv``."""
+        """Each environment's generator, as in Gymnasium's ``SyncVectorEnv``."""
         self._seed_the_rest()
         return tuple(self._generators)
 
     @property
     def np_random_seed(self) -> Any:
-        """Each row's seed, likewise."""
+        """Each environment's seed, likewise."""
         self._seed_the_rest()
         return tuple(self._seeds)
 
@@ -108,18 +108,18 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             seeds = [int(seeds) + i for i in range(self.num_envs)]
         if len(seeds) != self.num_envs:
             raise BufgymError(f"seed: {len(seeds)} seeds for {self.num_envs} environments")
-        mask = np.asarray(options.get("reset_mask", self._every_row))
-        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):  # numbers of rows are no mask
+        mask = np.asarray(options.get("reset_mask", self._every))
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,):  # indices are no mask
             raise BufgymError(f"options['reset_mask'] is {mask.dtype}{[*mask.shape]}: must be bool[{self.num_envs}]")
-        if any(self.rows.senders.episodes[i] is None for i in np.flatnonzero(~mask)):
-            raise gym.error.ResetNeeded("options['reset_mask'] leaves out rows that have no episode yet")
+        if any(self.sub_envs.senders.episodes[i] is None for i in np.flatnonzero(~mask)):
+            raise gym.error.ResetNeeded("options['reset_mask'] leaves out environments that have no episode yet")
         self._renew_output(keep=True)
         chosen = np.flatnonzero(mask)
         for i in chosen.tolist():
             if seeds[i] is not None:
                 self._seed(i, seeds[i])
         self._seed_the_rest()
-        self.rows.reset(chosen, options.get("episodes"))
+        self.sub_envs.reset(chosen, options.get("episodes"))
         self._steps[mask] = 0
         self._done = self._done & ~mask  # a new array: the last step may have returned the old one
         self._any_done = bool(self._done.any())
@@ -130,40 +130,40 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def step(
         self, actions: NDArray[np.int64] | NDArray[np.floating[Any]]
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        rows = self.rows
-        actions = rows.actions(actions)
-        if rows.senders.episodes[-1] is None:
+        sub_envs = self.sub_envs
+        actions = sub_envs.actions(actions)
+        if sub_envs.senders.episodes[-1] is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         restart = self._any_done and self.autoreset_mode != AutoresetMode.SAME_STEP
         if restart and self.autoreset_mode == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded("rows have ended: call reset(options={'reset_mask': done}) first")
+            raise gym.error.ResetNeeded("environments have ended: call reset(options={'reset_mask': done}) first")
         self._renew_output()
-        rows.step(actions)  # rows that have ended stay as they are
+        sub_envs.step(actions)  # those that have ended stay as they are
         if self.max_episode_steps is not None:
             self._steps += 1
         if restart:
-            rows.reset(np.flatnonzero(self._done))
+            sub_envs.reset(np.flatnonzero(self._done))
             self._steps[self._done] = 0
-        rewards = rows.rewards()
-        terminated = rows.output.terminated & ~self._done if restart else rows.output.terminated.copy()
+        rewards = sub_envs.rewards()
+        terminated = sub_envs.output.terminated & ~self._done if restart else sub_envs.output.terminated.copy()
         truncated = np.zeros(self.num_envs, np.bool_)
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps  # like Gymnasium's TimeLimit, even if the episode ends
         self._done = terminated | truncated
         self._any_done = bool(np.count_nonzero(self._done))
         if self._any_done and self.autoreset_mode == AutoresetMode.SAME_STEP:
-            rewards = rewards.copy()  # the rows that ended begin anew
+            rewards = rewards.copy()  # those that ended begin anew
         info = self._end(self._done) | self._info() if self._any_done else self._info()
         if self._window is not None:
             self.render()
         return self._observed(), rewards, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, actions]: the actions valid now in each row."""
-        return self.rows.action_masks()
+        """bool[n, actions]: the actions valid now in each environment."""
+        return self.sub_envs.action_masks()
 
     def render(self) -> Any:
-        """Each row as the single environment renders it; with "human" the first 16 in one window, and None."""
+        """Each environment as the single environment renders it; with "human" the first 16 in one window, and None."""
         if self.render_mode is None:
             gym.logger.warn(
                 "render() needs a render_mode: gym.make_vec(..., render_mode='ansi', 'rgb_array' or 'human')"
@@ -173,7 +173,8 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
         shown = self.num_envs if self._window is None else min(self.num_envs, render.MOST)
         drawn = tuple(
-            render.draw(self.rows.senders, i, self.render_mode, self.rows.output.slot_actions[i]) for i in range(shown)
+            render.draw(self.sub_envs.senders, i, self.render_mode, self.sub_envs.output.slot_actions[i])
+            for i in range(shown)
         )
         return drawn if self._window is None else self._window.show(drawn, self.metadata["render_fps"])
 
@@ -183,26 +184,26 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
             self._window.close()
 
     def _end(self, done: NDArray[np.bool_]) -> dict[str, Any]:
-        """The infos of rows that have ended; with SAME_STEP autoreset these rows begin anew at once."""
-        rows = self.rows
+        """The infos of environments that have ended; with SAME_STEP autoreset they begin anew at once."""
+        sub_envs = self.sub_envs
         last: dict[str, Any] = {}
         at = np.flatnonzero(done)
-        for name, of_ended in rows.summary(at).items():
+        for name, of_ended in sub_envs.summary(at).items():
             column = np.zeros(self.num_envs, of_ended.dtype)
             column[at] = of_ended
             last |= {name: column, f"_{name}": done}
-        ended = done & rows.output.terminated
-        if rows.options.bound and ended.any():
-            for name, column in rows.bounds(ended, rows.output.qoi).items():
+        ended = done & sub_envs.output.terminated
+        if sub_envs.options.bound and ended.any():
+            for name, column in sub_envs.bounds(ended, sub_envs.output.qoi).items():
                 last |= {name: column, f"_{name}": ended}
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             return last
-        # As in Gymnasium's SyncVectorEnv: one observation for each row that ended, None for the others.
+        # As in Gymnasium's SyncVectorEnv: one observation for each that ended, None for the others.
         observations: NDArray[Any] = np.full(self.num_envs, None, object)
         for i in np.flatnonzero(done).tolist():
-            observations[i] = rows.observation(i)
+            observations[i] = sub_envs.observation(i)
         last |= _only(done, self._info())
-        rows.reset(np.flatnonzero(done))
+        sub_envs.reset(np.flatnonzero(done))
         self._steps[done] = 0
         return {"final_obs": observations, "_final_obs": done, "final_info": last, "_final_info": done}
 
@@ -213,31 +214,31 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _observed(self) -> Observation:
         """The present observation; a dict of its own each time."""
         if not self._views:
-            return self.rows.observation()
-        return self.rows.form.masked(self._views.copy(), self.rows.output.action_mask)
+            return self.sub_envs.observation()
+        return self.sub_envs.form.masked(self._views.copy(), self.sub_envs.output.action_mask)
 
     def _new_buffers(self) -> Any:
         """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
-        rows, output = self.rows, self.rows.new_output()
-        shown: dict[str, Any] = {"action_mask": output.action_mask} if rows.options.shows_mask else {}
-        if rows.choices is not None and rows.options.shows_mask:
+        sub_envs, output = self.sub_envs, self.sub_envs.new_output()
+        shown: dict[str, Any] = {"action_mask": output.action_mask} if sub_envs.options.shows_mask else {}
+        if sub_envs.choices is not None and sub_envs.options.shows_mask:
             shown["slots"] = output.slot_actions
-        terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(rows.terms)}
-        if rows.options.shows_all:
+        terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(sub_envs.terms)}
+        if sub_envs.options.shows_all:
             shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}
-        views = rows.form.of(output.flat) if rows.form.is_view else {}
+        views = sub_envs.form.of(output.flat) if sub_envs.form.is_view else {}
         return (output, views, self._marked(shown)), [*output, *views.values(), *terms.values()]
 
     def _marked(self, columns: dict[str, Any]) -> dict[str, Any]:
-        """``columns`` with Gymnasium's marks: every row has each of them."""
-        marked = [((name, column), (f"_{name}", self._every_row)) for name, column in columns.items()]
+        """``columns`` with Gymnasium's marks: every environment has each of them."""
+        marked = [((name, column), (f"_{name}", self._every)) for name, column in columns.items()]
         return dict(pair for pairs in marked for pair in pairs)
 
     def _seed(self, i: int, seed: int | None) -> None:
-        """Give row ``i`` streams of its own, from ``seed``, or from chance if that is None."""
+        """Give environment ``i`` streams of its own, from ``seed``, or from chance if that is None."""
         generator, self._seeds[i] = seeding.np_random(seed)
         self._generators[i] = generator
-        self.rows.seed(i, generator)
+        self.sub_envs.seed(i, generator)
 
     def _seed_the_rest(self) -> None:
         for i, generator in enumerate(self._generators):
@@ -246,10 +247,10 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
-        rows, before = self.rows, self.rows.output
-        rows.output, self._views, self._shown = self._buffers.take()
-        if keep and rows.output is not before:
-            for new, old in zip(cast(Any, rows.output), before, strict=True):
+        sub_envs, before = self.sub_envs, self.sub_envs.output
+        sub_envs.output, self._views, self._shown = self._buffers.take()
+        if keep and sub_envs.output is not before:
+            for new, old in zip(cast(Any, sub_envs.output), before, strict=True):
                 new[...] = old
 
 

@@ -52,7 +52,7 @@ built_in(
     "foxglove-sdk",
     parameters={"depth": 1024.0},
     source="foxglove-sdk, message backlog of a client, default 1024",
-    about="Foxglove SDK: a client's oldest message goes when `depth` wait (at most L).",
+    about="Foxglove SDK: a client's oldest message is dropped when `depth` wait (at most L).",
 )(ros_keep_last)
 
 

@@ -192,13 +192,19 @@ class Policy:
         parameters = changed(f"policy {self.name}", self.parameters, settings)
         if not settings:
             return self
-        label = ",".join(f"{name}={number:g}" for name, number in settings.items())
+        label = ",".join(f"{name}={_written(number)}" for name, number in settings.items())
         return replace(self, name=f"{self.name}:{label}", parameters=parameters)
 
     @functools.cached_property
     def compiled(self) -> Functions:
         """Its functions compiled for one signature each, so that one rollout kernel serves every policy."""
         return _compiled(self.on_arrival, self.on_departure, self.on_dequeue, self.on_send)
+
+
+def _written(number: float) -> str:
+    """A setting in a policy's name. The number is in it whole, as other processes know the policy by its name."""
+    short = f"{number:g}"
+    return short if float(short) == number else repr(float(number))
 
 
 @functools.lru_cache(maxsize=256)

@@ -31,14 +31,14 @@ from bufgym.utils.errors import BufgymError, UnknownArgumentError
 def make_vec_env(
     env_id: str, n_envs: int = 1, seed: int | None = None, *, monitor_dir: str | None = None, **settings: Any
 ) -> VecEnv:
-    """Make ``n_envs`` rows of a native batch for stable-baselines3.
+    """Make a native batch of ``n_envs`` environments for stable-baselines3.
 
     Args:
         env_id: an id whose native batch can reset in the same step, as all of bufgym's can.
-        n_envs: rows.
+        n_envs: environments.
         seed: row i starts from seed + i at the first reset.
-        monitor_dir: folder that gets one file, ``0.monitor.csv``, with the episodes of all rows; ``load_results`` reads
-            it.
+        monitor_dir: folder that gets one file, ``0.monitor.csv``, with the episodes of all environments;
+            ``load_results`` reads it.
         settings: of the environment.
     """
     instead = "stable_baselines3.common.env_util.make_vec_env has single environments"
@@ -77,7 +77,7 @@ class GymVecEnv(VecEnv):
     l: steps, t: seconds since this object was made}; it also goes to ``results`` if given. Infos of other steps are
     empty, as n dicts cost more than a compiled step of n environments.
 
-    ``env_method(name)`` calls the batch's method once and returns its rows, so ``action_masks`` costs one call.
+    ``env_method(name)`` calls the batch's method once and returns its results, so ``action_masks`` costs one call.
     """
 
     def __init__(self, envs: VectorEnv[Any, Any, Any], *, results: ResultsWriter | None = None) -> None:
@@ -188,7 +188,7 @@ _SINGLE = {"observation_space": "single_observation_space", "action_space": "sin
 
 
 def _row(info: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """Extract environment ``i``'s info from a vector environment's, where ``_key`` masks the rows that have ``key``."""
+    """Extract environment ``i``'s info from a vector environment's, where ``_key`` masks those that have ``key``."""
     own: dict[str, Any] = {}
     for key, column in info.items():
         if key.startswith("_") and key[1:] in info:

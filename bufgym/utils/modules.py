@@ -118,9 +118,9 @@ def takes(function: Any, count: int) -> bool:
 
 
 def on_demand(package: str, places: Mapping[str, str]) -> Callable[[str], Any]:
-    """Make a room's ``__getattr__`` (PEP 562), which imports a public name when it is first asked for.
+    """Make a subpackage's ``__getattr__`` (PEP 562), which imports a public name when it is first asked for.
 
-    ``places`` maps each name to the room's module that defines it; a module's own name maps to itself.
+    ``places`` maps each name to the module in it that defines it; a module's own name maps to itself.
     """
 
     def get(name: str) -> Any:

@@ -72,8 +72,8 @@ def relayed(policy: str, seconds: float) -> dict[str, Any]:
     receive = subprocess.Popen([*bufgym, "receive", "--port", "0"], env=base, stdout=subprocess.PIPE, text=True)
     viewer = Viewer(python("viewer.py"), base)
     with ended(receive, viewer.process), tempfile.TemporaryDirectory() as folder:
-        told = (receive.stdout or iter(())).readline()
-        link = ShapedLink(Link(fade(seconds)), ("127.0.0.1", int(told.rpartition(":")[2])))
+        listening = (receive.stdout or iter(())).readline()
+        link = ShapedLink(Link(fade(seconds)), ("127.0.0.1", int(listening.rpartition(":")[2])))
         port = asyncio.run_coroutine_threadsafe(link.listen(), loop).result()
         config = Path(folder, "client.toml")
         config.write_text(CONFIG)

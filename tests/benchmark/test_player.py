@@ -33,8 +33,8 @@ def played(env: Any, player: Player, episode: Any) -> dict[str, Any]:
     env.reset(options={"episode": episode})
     ended, info = False, {}
     while not ended:
-        _, _, ended, _, info = env.step(player.action(env.rows.senders))
-    refuse("no decision is due", player.action, env.rows.senders)
+        _, _, ended, _, info = env.step(player.action(env.sub_envs.senders))
+    refuse("no decision is due", player.action, env.sub_envs.senders)
     return info
 
 
@@ -63,13 +63,13 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
     env.reset(seed=0)
     for decision, says in ((3, "decision 3"), (None, "on_arrival returned None: must be a whole number")):
         with pytest.raises(BufgymError, match=f"policy odd: {says}"):
-            Player(Policy("odd", lambda buffer, arrival, memory: decision)).action(env.rows.senders)  # noqa: B023
+            Player(Policy("odd", lambda buffer, arrival, memory: decision)).action(env.sub_envs.senders)  # noqa: B023
     env = gym.make("bufgym/Topics-v0", capacity=3).unwrapped
     env.reset(seed=0)
     env.step(4)  # accept: now the socket asks
     with pytest.raises(BufgymError, match="policy odd: sends slot 3"):
         odd = Policy("odd", policies.get("fifo").on_arrival, on_send=lambda buffer, memory: 3)
-        Player(odd).action(env.rows.senders)
+        Player(odd).action(env.sub_envs.senders)
     for name, why in (("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")):
         refuse(f"policy {name} {why}", Player, policies.get(name))
 

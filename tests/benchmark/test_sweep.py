@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import pickle
 import threading
 from pathlib import Path
 from typing import Any
@@ -86,9 +87,20 @@ def test_many_seeds_are_several_shards_and_the_same_rows(tmp_path: Path, small: 
 
 def test_the_baseline_is_always_there_and_the_suite_fills_what_is_open(small: Sweep) -> None:
     plan = Sweep("small-v1", ("afr",)).checked()
-    assert (plan.specs, plan.capacities, plan.seeds) == (("afr", "drop-oldest"), (2, 3), 2)
-    assert Sweep("small-v1", ("drop-oldest", "afr")).checked().specs == ("drop-oldest", "afr")
+    assert ([p.name for p in plan.policies], plan.capacities, plan.seeds) == (["afr", "drop-oldest"], (2, 3), 2)
+    assert [p.name for p in Sweep("small-v1", ("drop-oldest", "afr")).checked().policies] == ["drop-oldest", "afr"]
     assert plan.checked() == plan
+
+
+def test_a_policy_stays_what_it_is_and_other_processes_get_its_name(small: Sweep) -> None:
+    """A setting of ten digits is in the name whole, so the two are the same policy."""
+    filtered = policies.get("time-filter").with_parameters(separation_s=0.1234567891)
+    assert filtered.name == "time-filter:separation_s=0.1234567891"
+    assert policies.get("time-filter").with_parameters(separation_s=2.0).name == "time-filter:separation_s=2"
+    plan = Sweep(small.suite, (filtered,)).checked()
+    assert plan.policies[0] is filtered
+    there = pickle.loads(pickle.dumps(plan))
+    assert there.specs == (filtered.name, "drop-oldest", "afr") and there.policies == plan.policies
 
 
 def test_a_second_call_runs_nothing(tmp_path: Path, small: Sweep, monkeypatch: Patch) -> None:

@@ -84,7 +84,7 @@ def test_what_code_does_not_rest_on(before: str, after: str) -> None:
     assert hash_of(TALE.replace(before, after)) == hash_of(TALE)
 
 
-needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is kept without compilation"))
+needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is cached without compilation"))
 
 
 @needs_compilation
@@ -201,7 +201,7 @@ print(root(cells, Pair(1, 3)))
 """
 
 
-AT_NIGHT = [
+NIGHTLY = [
     ("FACTOR = 2", "FACTOR = 4", 10 * 4 + 1),
     ('("near", np.int64), ("far", np.int64)', '("far", np.int64), ("near", np.int64)', 20 * 2 + 1),
     ('("near", np.int64)', '("near", np.int32), ("gap", np.int32)', 10 * 2 + 1),
@@ -215,7 +215,7 @@ AT_NIGHT = [
     ("before", "after", "result"),
     [
         ("cells[0].near * FACTOR", "cells[0].near - FACTOR", 10 - 2 + 1),
-        *(pytest.param(*edit, marks=pytest.mark.nightly) for edit in AT_NIGHT),
+        *(pytest.param(*edit, marks=pytest.mark.nightly) for edit in NIGHTLY),
     ],
     ids=["callee two levels down", "constant", "fields of a dtype", "width of a field", "fields of a tuple"],
 )

@@ -1,4 +1,4 @@
-"""Where compiled code is kept: it rests on the sources as they are, and neither damage nor a lack of room is fatal."""
+"""Where compiled code is cached: it rests on the sources as they are, and survives damage and a lack of room."""
 
 import os
 import signal
@@ -50,7 +50,7 @@ class Numbers(NamedTuple):
     several: bool | None = None
 
 
-needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is kept without compilation"))
+needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is cached without compilation"))
 
 
 @needs_compilation

@@ -93,8 +93,8 @@ def test_a_spec_as_text_brings_its_own(module: str) -> None:
     arguments = {"scenario": f"{module}:short", "value": f"{module}:doorways"}
     spec = gym.make("bufgym/Interruption-v0", **arguments, actions="slots").spec  # type: ignore[arg-type]
     assert spec is not None
-    rows = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json())).unwrapped.rows  # type: ignore[attr-defined]
-    assert rows.scenario.t_max == 9 and rows.scenario.value.name == f"{module}:doorways"
+    sub_envs = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json())).unwrapped.sub_envs  # type: ignore[attr-defined]
+    assert sub_envs.scenario.t_max == 9 and sub_envs.scenario.value.name == f"{module}:doorways"
 
 
 def test_links_from_a_function_of_a_seed(module: str) -> None:

@@ -62,7 +62,7 @@ def test_a_python_policy_cannot_write(write: str) -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match="read-only"):
         for _ in range(9):
-            env.step(player.action(env.rows.senders))
+            env.step(player.action(env.sub_envs.senders))
 
 
 @pytest.mark.parametrize("write", WRITES)

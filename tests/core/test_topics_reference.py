@@ -306,7 +306,7 @@ def test_a_step_reads_no_topic_that_has_had_no_message():
     streams = [Stream(Topic(name), hz, 40_000) for name, hz in (("a", 20.0), ("b", 10.0), ("silent", 0.1))]
     env = SenderEnv(Client(tuple(streams), (Trace.constant(1e6, 10),), duration_s=10.0), 4, observation="flat")
     _, info = env.reset(seed=4)
-    arrivals, batch = env.rows.senders.episodes[0].arrivals, env.rows.senders.batch
+    arrivals, batch = env.sub_envs.senders.episodes[0].arrivals, env.sub_envs.senders.batch
     begins = int(np.flatnonzero(arrivals["topic"] == 2)[0])
     assert begins > 60
     for name in ("priority", "weight", "aged"):

@@ -60,4 +60,4 @@ def last_info(env: Any, act: Callable[[Any, dict[str, Any]], Any], **reset: Any)
 
 def text(env: SenderEnv) -> list[str]:
     """The frame without colours, line by line."""
-    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.rows.senders, 0)).splitlines()
+    return re.sub(r"\x1b\[[0-9;]*m", "", render.ansi(env.sub_envs.senders, 0)).splitlines()

@@ -11,7 +11,7 @@ from refusal_cases import refuse
 
 from bufgym import oracle, policies
 from bufgym.envs import SenderEnv, SenderVectorEnv, expert
-from bufgym.envs.rows import Rows
+from bufgym.envs.sub_envs import SubEnvs
 from bufgym.jit import named
 from bufgym.model import qoi
 from bufgym.model.link import Link
@@ -45,11 +45,11 @@ def log(a: float, b: float, shift: float = 0.0) -> float:
     return min(max(math.log(a / b) + shift, -3.0), 3.0)
 
 
-def reference(rows: Rows, i: int, k: int) -> tuple[list[int], list[float]]:
+def reference(sub_envs: SubEnvs, i: int, k: int) -> tuple[list[int], list[float]]:
     """What row ``i`` shows: the slot action of each action, and every number observed, written down from the text."""
-    batch = named(rows.senders.batch)
+    batch = named(sub_envs.senders.batch)
     buffer, arrival = python_view(batch, i), python_arrival(batch, i)
-    s, L = len(buffer.slots), rows.capacity
+    s, L = len(buffer.slots), sub_envs.capacity
     queue = [*buffer.slots, arrival]
     x = [buffer.dequeued_x, *(message.x for message in queue)]
     step = x[-1] - buffer.previous_x
@@ -64,7 +64,7 @@ def reference(rows: Rows, i: int, k: int) -> tuple[list[int], list[float]]:
     room = s < L and buffer.backlog_bytes + arrival.size_bytes <= buffer.max_bytes
     none = (L + 1 if room else L) if order[0] is None else None
     slots = [none if j is None else L if j == s else j for j in (order[0] if j is None else j for j in order)]
-    if rows.options.asked_at == "arrival":
+    if sub_envs.options.asked_at == "arrival":
         slots = [L + 1 if room else slots[0], *slots]
     e = (x[-1] - x[0]) / (L + 1)
     columns = []
@@ -76,8 +76,8 @@ def reference(rows: Rows, i: int, k: int) -> tuple[list[int], list[float]]:
         columns.append([*flags, log(cost[j], 2 * e), log(before[j], e), log(after[j], e)])
     short, medium, rate = (1e-6 * getattr(buffer, f"{n}_rate_bytes_per_s") for n in ("short", "medium", "long"))
     period, size = max(buffer.period_us, 1.0), arrival.size_bytes
-    gain = qoi_of(rows, e)
-    bend = 2 * (2 * gain - qoi_of(rows, 2 * e)) / gain - 1 if gain > 0 else -1.0
+    gain = qoi_of(sub_envs, e)
+    bend = 2 * (2 * gain - qoi_of(sub_envs, 2 * e)) / gain - 1 if gain > 0 else -1.0
     context = [
         log(buffer.left_bytes, short * period),
         log(short, rate),
@@ -92,12 +92,12 @@ def reference(rows: Rows, i: int, k: int) -> tuple[list[int], list[float]]:
     return slots, [*np.array(columns).T.ravel().tolist(), *context]
 
 
-def qoi_of(rows: Rows, distance: float) -> float:
+def qoi_of(sub_envs: SubEnvs, distance: float) -> float:
     """V of a distance."""
-    return float(rows.senders.value.information(np.array([0.0, distance])) - 1)
+    return float(sub_envs.senders.value.information(np.array([0.0, distance])) - 1)
 
 
-def rows_of(scenario: Any, n: int, **options: Any) -> SenderVectorEnv:
+def batch_of(scenario: Any, n: int, **options: Any) -> SenderVectorEnv:
     return SenderVectorEnv(n, scenario, autoreset_mode="SameStep", **options)
 
 
@@ -107,11 +107,11 @@ def rows_of(scenario: Any, n: int, **options: Any) -> SenderVectorEnv:
 def test_order_and_numbers_are_those_of_the_reference_model(scenario: Any, more: dict[str, Any], asks: str) -> None:
     rng, missing = np.random.default_rng(0), 0
     for L, k in ((1, 2), (4, 1), (5, 3)):
-        envs = rows_of(scenario, 2, capacity=L, candidates=k, decide_at=asks, **more)
+        envs = batch_of(scenario, 2, capacity=L, candidates=k, decide_at=asks, **more)
         seen, info = envs.reset(seed=L)
         for _ in range(60):
-            for i in np.flatnonzero(envs.rows.senders.batch.senders["waiting"] == 1).tolist():
-                slots, numbers = reference(envs.rows, i, k)
+            for i in np.flatnonzero(envs.sub_envs.senders.batch.senders["waiting"] == 1).tolist():
+                slots, numbers = reference(envs.sub_envs, i, k)
                 assert info["slots"][i].tolist() == slots
                 assert seen[i] == pytest.approx(numbers, abs=2e-6)
                 missing += int((info["action_mask"][i] == 0).sum())
@@ -137,7 +137,7 @@ def test_a_queue_by_hand() -> None:
     assert before == pytest.approx(np.log(np.array([1, 1, 1]) / e), abs=1e-6)
     assert after == pytest.approx(np.log(np.array([2, 3, 3]) / e), abs=1e-6)
     env.step(0)  # x = 5 goes
-    batch = named(env.rows.senders.batch)
+    batch = named(env.sub_envs.senders.batch)
     first = batch.senders[0].first
     assert batch.slots.x[0, first : first + 3].tolist() == [1, 4, 7]
 
@@ -152,14 +152,14 @@ def test_no_action_leaves_the_link_idle() -> None:
         while not ended:
             assert info["slots"].tolist() == [4, 4, 4, 4] and info["action_mask"].tolist() == [1, 0, 0, 0]
             _, _, ended, _, info = env.step(action)
-        assert named(env.rows.senders.batch).senders[0].dequeued == 6
+        assert named(env.sub_envs.senders.batch).senders[0].dequeued == 6
 
 
 @kernels
 def test_actions_do_what_the_slot_actions_do() -> None:
     """Two environments in the same states: one takes candidates, the other the slots that they stand for."""
     for asks in ("overflow", "arrival"):
-        few, slots = (rows_of(JPEG, 4, capacity=5, decide_at=asks, actions=a) for a in ("candidates", "slots"))
+        few, slots = (batch_of(JPEG, 4, capacity=5, decide_at=asks, actions=a) for a in ("candidates", "slots"))
         info = few.reset(seed=0)[1]
         slots.reset(seed=0)
         rng = np.random.default_rng(1)
@@ -174,16 +174,16 @@ def test_actions_do_what_the_slot_actions_do() -> None:
 def test_the_defaults_of_each_kind_of_environment() -> None:
     env = gym.make("bufgym/Uplink-v0")
     assert (env.action_space, env.observation_space.shape) == (gym.spaces.Discrete(3), (27,))
-    assert env.unwrapped.rows.senders.decide_at == "overflow"
+    assert env.unwrapped.sub_envs.senders.decide_at == "overflow"
     slots = gym.make("bufgym/Uplink-v0", actions="slots")
-    assert (slots.action_space, slots.unwrapped.rows.senders.decide_at) == (gym.spaces.Discrete(10), "arrival")
+    assert (slots.action_space, slots.unwrapped.sub_envs.senders.decide_at) == (gym.spaces.Discrete(10), "arrival")
     assert gym.make("bufgym/Topics-v0").action_space == gym.spaces.Discrete(34)
     named = gym.make("bufgym/Uplink-v0", candidates=3, decide_at="arrival", observation="dict")
     assert named.action_space == gym.spaces.Discrete(5) and named.observation_space["candidate_merged"].shape == (4,)
 
 
 def test_a_batch_has_the_rows_of_single_environments() -> None:
-    envs = rows_of(JPEG, 3, capacity=4)
+    envs = batch_of(JPEG, 3, capacity=4)
     seen, info = envs.reset(seed=5)
     for i in range(3):
         env = SenderEnv(JPEG, 4)
@@ -204,7 +204,7 @@ def test_logarithms_are_right_to_a_millionth() -> None:
 
 def test_a_rule_plays_among_candidates() -> None:
     """``min-motion-gap`` is the cheapest candidate; as an expert it reaches in the environment what it has in a run."""
-    envs = rows_of(EQUAL, 3, capacity=5, info="mask")
+    envs = batch_of(EQUAL, 3, capacity=5, info="mask")
     episodes = [draw(EQUAL, seed) for seed in range(3)]
     envs.reset(options={"episodes": episodes})
     rule, qoi_at_end = expert.PolicyExpert(envs, "min-motion-gap"), np.zeros(3)
@@ -249,12 +249,12 @@ SHORT = Uplink(**MOVING | {"value": qoi.exponential(0.4)}, duration_s=5.0)
 def test_regrets_of_an_episode_sum_to_what_it_lacks(asks: str, actions: str, n: int) -> None:
     """H less the best attainable at the first decision; at arrivals that is the clairvoyant's H of the episode.
 
-    In the night of a thousand episodes.
+    Nightly with a thousand episodes.
     """
-    envs = rows_of(SHORT, n, capacity=4, decide_at=asks, actions=actions, reward="regret", info="mask")
+    envs = batch_of(SHORT, n, capacity=4, decide_at=asks, actions=actions, reward="regret", info="mask")
     episodes = [draw(SHORT, seed) for seed in range(n)]
     info = envs.reset(options={"episodes": episodes})[1]
-    start = np.nanmax(Hindsight(envs.rows.senders, "a test").values(), axis=1)  # of all decisions, not of a few
+    start = np.nanmax(Hindsight(envs.sub_envs.senders, "a test").values(), axis=1)  # of all decisions, not of a few
     if asks == "arrival":
         assert start == pytest.approx([oracle.clairvoyant(e, 4, SHORT.value).qoi for e in episodes], abs=1e-9)
     rng, total, over = np.random.default_rng(0), np.zeros(n), np.zeros(n, np.bool_)
@@ -272,7 +272,7 @@ def test_regrets_of_an_episode_sum_to_what_it_lacks(asks: str, actions: str, n: 
 
 @kernels
 def test_regret_is_the_same_alone_and_in_a_batch() -> None:
-    envs, env = rows_of(SHORT, 2, capacity=3, reward="regret"), SenderEnv(SHORT, 3, reward={"regret": 1.0})
+    envs, env = batch_of(SHORT, 2, capacity=3, reward="regret"), SenderEnv(SHORT, 3, reward={"regret": 1.0})
     envs.reset(seed=0)
     env.reset(seed=1)
     for action in (0, 1, 2, 0, 2, 1) * 5:

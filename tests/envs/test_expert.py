@@ -48,7 +48,7 @@ def playing(episode: Episode, capacity: int, v: Any = V, **options: Any) -> Send
 
 def brute(env: SenderEnv) -> dict[int, float]:
     """The best H of all action sequences, by the first of them."""
-    arrays = (*env.rows.senders.batch[:5], *env.rows.output, env.rows.rewarded)
+    arrays = (*env.sub_envs.senders.batch[:5], *env.sub_envs.output, env.sub_envs.rewarded)
     kept, values = [array.copy() for array in arrays], {}
     for action in np.flatnonzero(env.action_masks()).tolist():
         _, _, ended, _, info = env.step(action)
@@ -119,14 +119,14 @@ def test_who_follows_it_earns_what_it_says(family: Any, steps_at_random: int, ca
     envs.reset(options={"episodes": [draw(family, seed) for seed in range(n)]})
     know = expert.clairvoyant(envs)
     for _ in range(steps_at_random):
-        envs.rows.step(np.array([valid_action(mask, rng) for mask in envs.action_masks()]))
+        envs.sub_envs.step(np.array([valid_action(mask, rng) for mask in envs.action_masks()]))
     promised = np.nanmax(know.values(), axis=1)
-    while not envs.rows.output.terminated.all():
+    while not envs.sub_envs.output.terminated.all():
         actions = know.actions()
         given_away = know.regrets()[np.arange(n), actions]
         assert (np.isnan(given_away) | (given_away < 1e-9)).all()
-        envs.rows.step(actions)
-    assert envs.rows.output.qoi == pytest.approx(promised, abs=1e-7)  # of values within 1e-9 any may be taken
+        envs.sub_envs.step(actions)
+    assert envs.sub_envs.output.qoi == pytest.approx(promised, abs=1e-7)  # of values within 1e-9 any may be taken
     if steps_at_random == 0:
         best = [oracle.clairvoyant(draw(family, seed), capacity, V).qoi for seed in range(n)]
         assert promised == pytest.approx(best, abs=1e-9)
@@ -182,9 +182,9 @@ def test_a_policy_reaches_what_its_rollout_reaches(name: str) -> None:
         while not ended.all():
             actions = asked.actions()
             assert np.array_equal(asked.actions(), actions)
-            envs.rows.step(actions)
-            ended = envs.rows.output.terminated
-        last[half : half + n] = envs.rows.output.qoi
+            envs.sub_envs.step(actions)
+            ended = envs.sub_envs.output.terminated
+        last[half : half + n] = envs.sub_envs.output.qoi
     assert last == pytest.approx([outcome(reached, i).qoi for i in range(2 * n)])
 
 
@@ -228,10 +228,10 @@ def test_what_is_recorded_can_be_played_again(kind: str) -> None:
             seen, reward, ended, _, info = env.step(action)
             assert reward == played.rewards[t]
         assert ended and np.array_equal(seen, played.observations[-1]) and info["qoi"] == played.qoi[-1]
-        episode = env.rows.senders.episodes[0]
+        episode = env.sub_envs.senders.episodes[0]
         assert episode is not None and played.regret is not None
         # What its decisions gave away one by one is what it lacks in the end.
-        most = oracle.clairvoyant(episode, 4, env.rows.senders.value).qoi
+        most = oracle.clairvoyant(episode, 4, env.sub_envs.senders.value).qoi
         assert info["qoi"] + played.regret.sum() == pytest.approx(most, abs=1e-9)
 
 
@@ -245,7 +245,7 @@ def test_a_data_set_recovers_its_environment(tmp_path: Path, monkeypatch: pytest
     made = minari.load_dataset("bufgym/interruption/mixed-v0")
     assert made.total_episodes == 7
     env = made.recover_environment()
-    assert env.unwrapped.rows.capacity == 3 and env.unwrapped.rows.scenario.t_max == 20
+    assert env.unwrapped.sub_envs.capacity == 3 and env.unwrapped.sub_envs.scenario.t_max == 20
     for episode in made:
         assert len(episode.infos["regret"]) == len(episode.actions) + 1 == len(episode.infos["action_mask"])
         assert episode.terminations[-1] and not episode.truncations.any()

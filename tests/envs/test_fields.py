@@ -105,7 +105,7 @@ def test_fields_beside_candidates_by_hand() -> None:
     env = SenderEnv("lte", 2, fields=["rank", "occupancy", "time_merged"], observation="dict")
     link = Link(Trace.steps([(100.0, 0.0), (100.0, 1e6)]), 0, 0)
     seen, _ = env.reset(options={"episode": Episode(arrivals, link)})
-    assert env.rows.senders.batch.senders["next"][0] == 3
+    assert env.sub_envs.senders.batch.senders["next"][0] == 3
     np.testing.assert_array_equal(seen["rank"], np.float32([1 / 3, 2 / 3, 1]))
     assert seen["occupancy"].tolist() == [1.0]
     # Three gaps of a second up to the newcomer: the even spacing is 1 s, and each message leaves a gap of two of them.

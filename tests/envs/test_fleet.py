@@ -67,7 +67,7 @@ def test_an_episode_is_the_rollout_of_the_same_policy(reward):
             assert not truncated[agent]
     assert ticks == scenario.max_messages
     fleet = run_fleet(policies.get("drop-oldest"), [episode], L, scenario.value)
-    assert (np.asarray(env.rows.senders.batch.log) == np.asarray(fleet.senders.batch.log)).all()
+    assert (np.asarray(env.sub_envs.senders.batch.log) == np.asarray(fleet.senders.batch.log)).all()
     for agent in env.possible_agents:
         assert infos[agent]["qoi"] == pytest.approx(1 + own[agent])
         assert infos[agent]["arrived"] == infos[agent]["delivered"] + infos[agent]["dropped"]
@@ -128,13 +128,13 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
     head, *lines = env.render().splitlines()
     assert head.endswith("of 3 sending")
     assert [line.split()[0] for line in lines] == env.possible_agents
-    queued = env.rows.senders.batch.senders[1]["occupancy"]
+    queued = env.sub_envs.senders.batch.senders[1]["occupancy"]
     assert (lines[1].count("■"), lines[1].count("·")) == (queued, L - queued)
     shown.append(image.render())
     assert all(frame.shape == (400, 800, 3) and frame.dtype == np.uint8 for frame in shown)
     before, after = (int((frame == (0xE0, 0xA1, 0x00)).all(axis=-1).sum()) for frame in shown)
     assert after > before + 500  # the legend has the colour, too
-    assert (image.rows.senders.batch.senders["next"] == 8).all()  # drawing changes nothing
+    assert (image.sub_envs.senders.batch.senders["next"] == 8).all()  # drawing changes nothing
     envs = FleetVecEnv(1, 2, "lte", L, **PARAMETERS, render_mode="rgb_array")
     envs.reset(seed=0)
     assert [frame.shape for frame in envs.render()] == [(400, 800, 3)] * 2
@@ -231,11 +231,11 @@ def test_cells_can_be_given_and_begun_one_by_one():
     envs = FleetVecEnv(2, 2, "lte", L, autoreset_mode=AutoresetMode.DISABLED, **PARAMETERS)
     given = FleetScenario.of(2, "lte", **PARAMETERS).draw(Streams.seeded(4))
     envs.reset(seed=0, options={"episodes": [None, given]})
-    assert envs.rows.senders.episodes[3].arrivals is given.arrivals[1]
+    assert envs.sub_envs.senders.episodes[3].arrivals is given.arrivals[1]
     for _ in range(10):
         envs.step(np.full(4, L + 1))
     envs.reset(options={"reset_mask": np.array([False, False, True, True]), "episodes": [None, given]})
-    assert envs.rows.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
+    assert envs.sub_envs.senders.batch.senders["next"].tolist() == [10, 10, 0, 0]
 
 
 @pytest.mark.kernels
@@ -258,4 +258,4 @@ def test_a_robot_that_is_asked_again_holds_the_others_up():
     assert steps[4:] == [(True, False, 3, 0), (True, False, 2, 0)]
     assert all(infos[agent]["invalid"] == 0 for agent in infos)
     rollout = run_fleet(policies.get("drop-oldest"), [episode], 8, FleetScenario.of(2, "lte").value, max_bytes=2_500)
-    assert (np.asarray(env.rows.senders.batch.log)[:, :5] == np.asarray(rollout.senders.batch.log)).all()
+    assert (np.asarray(env.sub_envs.senders.batch.log)[:, :5] == np.asarray(rollout.senders.batch.log)).all()

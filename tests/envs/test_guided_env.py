@@ -32,13 +32,13 @@ def played(case: str, choose: Any, seed: int = 0) -> tuple[SenderEnv, Any]:
     scenario, options = CASES[case]
     env = SenderEnv(scenario, L, actions="guided", fields="guided", **options)
     assert last_info(env, lambda seen, _: choose(seen), seed=seed)["invalid"] == 0
-    return env, env.rows.senders.batch.log["dropped_us"][0]
+    return env, env.sub_envs.senders.batch.log["dropped_us"][0]
 
 
 def rolled(env: SenderEnv, case: str, policy: Any) -> Any:
     """The same of a policy on the environment's episode."""
     scenario, options = CASES[case]
-    return run(policy, [env.rows.senders.episodes[0]], L, scenario.value, **options).batch.log["dropped_us"][0]
+    return run(policy, [env.sub_envs.senders.episodes[0]], L, scenario.value, **options).batch.log["dropped_us"][0]
 
 
 def zero(seen: Any) -> Any:
@@ -61,7 +61,7 @@ def test_who_sees_what_the_rule_sees_may_choose_slots(case: str) -> None:
     for fields in ("guided", None):
         env = SenderEnv(scenario, L, actions="slots", fields=fields, **options)
         last_info(env, lambda _, info: int(np.argmax(info["action_mask"])), seed=0)
-        gone.append(env.rows.senders.batch.log["dropped_us"][0].copy())
+        gone.append(env.sub_envs.senders.batch.log["dropped_us"][0].copy())
     assert np.array_equal(*gone) and (gone[0] > 0).any()
 
 

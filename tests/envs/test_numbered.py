@@ -31,7 +31,7 @@ L = 2
 def played(env: Any, policy: str, **reset: Any) -> dict[str, Any]:
     """The last info of the episode that ``policy`` plays."""
     player = Player(policies.get(policy))
-    return last_info(env, lambda *_: player.action(env.unwrapped.rows.senders), **reset)
+    return last_info(env, lambda *_: player.action(env.unwrapped.sub_envs.senders), **reset)
 
 
 def score(rows: list[dict[str, Any]], row: dict[str, Any]) -> float:
@@ -84,7 +84,7 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
     players = {name: Player(policies.get(name), len(rows)) for name in PLAYED}
     last: list[dict[str, Any]] = [{} for _ in rows]
     while not all(last):
-        senders = envs.unwrapped.rows.senders
+        senders = envs.unwrapped.sub_envs.senders
         due = senders.batch.senders["waiting"]
         actions = [players[row["policy"]].action(senders, i) if due[i] else L for i, row in enumerate(rows)]
         _, _, ended, _, info = envs.step(np.array(actions))
@@ -103,7 +103,7 @@ def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
     assert row["trace"] == "same#2" and played(env, "random", options={"trace": 1, "seed": 1})["qoi"] == info["qoi"]
     alone = SenderEnv(Interruption(t_max=30), L, actions="slots")
     alone.reset(options={"seed": 5})
-    assert alone.rows.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
+    assert alone.sub_envs.senders.episodes[0].last_decision == draw(Interruption(t_max=30), 5).last_decision  # type: ignore[union-attr]
 
 
 def suite_env(**arguments: Any) -> Any:
@@ -191,7 +191,7 @@ TEXTS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
 def test_text_makes_the_same_also_as_json(env_id: str, arguments: dict[str, Any], objects: dict[str, Any]) -> None:
     env: Any = gym.make(env_id, capacity=3, **arguments)
     again: Any = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    scenario = env.unwrapped.rows.scenario
+    scenario = env.unwrapped.sub_envs.scenario
     for name, expected in objects.items():
         assert getattr(scenario, name) == expected
     if "traces" in arguments:
@@ -199,7 +199,7 @@ def test_text_makes_the_same_also_as_json(env_id: str, arguments: dict[str, Any]
         assert [trace.name for trace in scenario.traces] == ([names] if isinstance(names, str) else names)
         motions = [name for name in np.atleast_1d(arguments["motion"]) if name != "none"]
         assert [motion.name for motion in scenario.motion] == motions
-    assert again.unwrapped.rows.scenario.value == scenario.value
+    assert again.unwrapped.sub_envs.scenario.value == scenario.value
     for first, second in zip(env.reset(seed=3), again.reset(seed=3), strict=True):
         np.testing.assert_equal(first, second)
 
@@ -215,7 +215,7 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
         actions="slots",
     )
     env.reset(seed=0)
-    assert env.unwrapped.rows.senders.episodes[0].arrivals["size_bytes"].tolist() == [1000, 2000, 500]
+    assert env.unwrapped.sub_envs.senders.episodes[0].arrivals["size_bytes"].tolist() == [1000, 2000, 500]
 
 
 def uplink(**arguments: Any) -> Any:
@@ -246,15 +246,15 @@ def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
 
     def sent(policy: str, seed: int) -> list[int]:
         played(env, policy, seed=seed)
-        senders = env.unwrapped.rows.senders
+        senders = env.unwrapped.sub_envs.senders
         return [int(k) for k in senders.batch.order[0, : senders.batch.senders[0]["transmitted"]]]
 
     random = [sent("random", seed) for seed in range(4)]
     assert random == [sent("random", seed) for seed in range(4)]
     assert random != [sent("drop-oldest", seed) for seed in range(4)]
     env.reset(seed=0)
-    Player(policies.get("random")).action(env.unwrapped.rows.senders)
-    assert env.unwrapped.rows.senders.episodes[0].arrivals["uniform"].any()
+    Player(policies.get("random")).action(env.unwrapped.sub_envs.senders)
+    assert env.unwrapped.sub_envs.senders.episodes[0].arrivals["uniform"].any()
 
 
 UPLINK = Uplink(traces=(Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)]),), jitter=0.8, duration_s=0.4)
@@ -285,7 +285,7 @@ def test_the_set_is_the_same_for_every_row_and_seed() -> None:
         )
         batch.reset(seed=seed)
         single.reset(seed=seed)
-        played = [*batch.rows.senders.episodes, *single.rows.senders.episodes]
+        played = [*batch.sub_envs.senders.episodes, *single.sub_envs.senders.episodes]
         arrivals |= {episode.arrivals["arrival_us"].tobytes() for episode in played if episode is not None}
     assert len(arrivals) == 2
 
@@ -293,7 +293,7 @@ def test_the_set_is_the_same_for_every_row_and_seed() -> None:
 def test_fleets_have_one_too() -> None:
     envs = FleetVecEnv(4, 2, UPLINK, CAPACITY, pool=1)
     envs.reset(seed=1)
-    links = {(episode.link.trace.name, episode.link.offset_us) for episode in envs.rows.senders.episodes if episode}
+    links = {(episode.link.trace.name, episode.link.offset_us) for episode in envs.sub_envs.senders.episodes if episode}
     assert len(links) == 1
 
 
@@ -306,8 +306,12 @@ def test_a_reset_that_is_refused_touches_no_row() -> None:
     """Of three episodes given the last is too long: the rows before it go on with what they have."""
     batch = SenderVectorEnv(3, UPLINK, CAPACITY, actions="slots")
     batch.reset(seed=1)
-    before = batch.rows.senders.batch.arrivals.copy()
+    before = batch.sub_envs.senders.batch.arrivals.copy()
     long = Uplink(traces=UPLINK.traces, duration_s=2.0).draw(Streams.seeded(3))
     with pytest.raises(BufgymError, match="these senders have room for"):
         batch.reset(options={"episodes": [UPLINK.draw(Streams.seeded(2)), None, long]})
-    assert (batch.rows.senders.batch.arrivals == before).all() and batch.rows.senders.begun.tolist() == [1, 1, 1]
+    assert (batch.sub_envs.senders.batch.arrivals == before).all() and batch.sub_envs.senders.begun.tolist() == [
+        1,
+        1,
+        1,
+    ]

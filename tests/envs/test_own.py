@@ -20,7 +20,7 @@ from refusal_cases import refuse, refused
 import bufgym
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
 from bufgym.envs.options import Options
-from bufgym.envs.rows import Rows
+from bufgym.envs.sub_envs import SubEnvs
 from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
@@ -150,7 +150,7 @@ def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
             assert reward == pytest.approx(sum(terms_of(env_id).get(name, 0.0) * terms[name] for name in terms))
             for name, number in terms.items():
                 total[name] += number
-        senders = env.rows.senders
+        senders = env.sub_envs.senders
         result, count = outcome(senders, 0), int(senders.batch.senders["transmitted"][0])
         propagation_s = int(senders.batch.senders["propagation_us"][0]) / 1e6
         assert total["delay"] == pytest.approx(-count * (result.mean_sojourn_s + propagation_s))
@@ -297,14 +297,14 @@ SCENARIO = Uplink(traces=(LINK,), rate_hz=10, duration_s=FRAMES / 10, size_bytes
 def played() -> tuple[Any, Any, Any]:
     """Delivered and retained rewards and the QoI held afterwards, float64[sequences, steps], of all sequences."""
     sequences = np.array(list(product(range(L + 2), repeat=FRAMES)))
-    rows = Rows(len(sequences), SCENARIO, Options(capacity=L, actions="slots"))
-    rows.reset(np.arange(len(rows)), [draw(SCENARIO, 0)] * len(rows))
+    sub_envs = SubEnvs(len(sequences), SCENARIO, Options(capacity=L, actions="slots"))
+    sub_envs.reset(np.arange(len(sub_envs)), [draw(SCENARIO, 0)] * len(sub_envs))
     rewards, held = [], []
     for actions in sequences.T:
-        rows.step(np.ascontiguousarray(actions))
-        rewards.append(rows.output.reward_terms[:, :2].copy())
-        held.append(rows.rewarded[:, 1] - rows.rewarded[:, 0])
-    assert rows.output.terminated.all()
+        sub_envs.step(np.ascontiguousarray(actions))
+        rewards.append(sub_envs.output.reward_terms[:, :2].copy())
+        held.append(sub_envs.rewarded[:, 1] - sub_envs.rewarded[:, 0])
+    assert sub_envs.output.terminated.all()
     delivered, retained = np.stack(rewards, axis=1).transpose(2, 0, 1)
     return delivered, retained, np.stack(held, axis=1)
 

@@ -97,7 +97,7 @@ def test_lines_keep_to_the_width(capacity: int) -> None:
     lines = text(env)
     assert max(map(len, lines[1:4])) <= 100
     assert lines[3].endswith("?")
-    check(render.rgb_array(env.rows.senders, 0), "rgb_array")
+    check(render.rgb_array(env.sub_envs.senders, 0), "rgb_array")
 
 
 @pytest.mark.parametrize("arrivals_us", [[0], [0, 0, 0], [5, 10**9]])
@@ -109,7 +109,7 @@ def test_odd_episodes(arrivals_us: list[int]) -> None:
     ended = False
     while True:
         assert len(text(env)) >= 5
-        check(render.rgb_array(env.rows.senders, 0), "rgb_array")
+        check(render.rgb_array(env.sub_envs.senders, 0), "rgb_array")
         if ended:
             break
         ended = env.step(2)[2]

@@ -37,7 +37,7 @@ def test_a_scale_multiplies_the_reward_and_nothing_else(id: str) -> None:
     plain = played(gym.make_vec(id, 2, **SMALL[id]))
     for scale in (0.25, "episode"):
         envs = gym.make_vec(id, 2, reward_scale=scale, **SMALL[id])
-        factor = scale if scale != "episode" else envs.unwrapped.rows.scenario.reward_scale
+        factor = scale if scale != "episode" else envs.unwrapped.sub_envs.scenario.reward_scale
         for (before, terms), (rewards, same_terms) in zip(plain, played(envs), strict=True):
             np.testing.assert_allclose(rewards, factor * before, rtol=1e-12)
             assert str(terms) == str(same_terms)
@@ -51,11 +51,13 @@ def test_a_fleet_has_the_scale_of_its_uplink() -> None:
 
 def test_weights_of_your_own_terms_are_the_size_that_you_give_them() -> None:
     rewards = {"retained": 1.0, "half_of_a_point": 3.0}
-    rows = SenderEnv("lte", reward=rewards, reward_scale="episode", actions="slots").rows
-    weights = {term.name: weight for term, weight in zip(rows.terms, rows.weights.tolist(), strict=True) if weight}
+    sub_envs = SenderEnv("lte", reward=rewards, reward_scale="episode", actions="slots").sub_envs
+    weights = {
+        term.name: weight for term, weight in zip(sub_envs.terms, sub_envs.weights.tolist(), strict=True) if weight
+    }
     assert weights == {"retained": 0.1, "half_of_a_point": 3.0}
-    rows = SenderEnv("lte", reward=rewards, reward_scale=2, actions="slots").rows
-    assert [weight for weight in rows.weights.tolist() if weight] == [2.0, 6.0]
+    sub_envs = SenderEnv("lte", reward=rewards, reward_scale=2, actions="slots").sub_envs
+    assert [weight for weight in sub_envs.weights.tolist() if weight] == [2.0, 6.0]
 
 
 @pytest.mark.parametrize("id", bufgym.ENVIRONMENTS)

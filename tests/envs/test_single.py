@@ -52,7 +52,7 @@ def begun(**options: Any) -> SenderEnv:
 
 def seen(env: SenderEnv) -> tuple[Buffer, Any]:
     """The Buffer and the newcomer as a policy of plain Python gets them."""
-    batch = named(env.rows.senders.batch)
+    batch = named(env.sub_envs.senders.batch)
     return python_view(batch, 0), batch.arrivals[0, batch.senders[0].next]
 
 
@@ -113,7 +113,7 @@ def test_a_message_that_arrives_at_the_server_as_the_step_ends_is_rewarded_in_it
 def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> None:
     """Masks, bounds, sums of rewards and what became of all, under actions of which many are invalid."""
     env, rng = make(scenario, **options), np.random.default_rng(1)
-    L, most = env.rows.capacity, options.get("max_bytes", UNLIMITED_BYTES)
+    L, most = env.sub_envs.capacity, options.get("max_bytes", UNLIMITED_BYTES)
     for seed in (7, None):
         observation, info = env.reset(seed=seed)
         ended, total, invalid = False, np.zeros(2), 0
@@ -122,7 +122,7 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
             assert env.observation_space.contains(observation)
             held.append((observation, {name: array.copy() for name, array in observation.items()}))
             allowed = [True] * (L + 2)  # an episode that asks for no decision: actions have no effect
-            if env.rows.senders.batch.senders[0]["waiting"]:
+            if env.sub_envs.senders.batch.senders[0]["waiting"]:
                 buffer, arrival = seen(env)
                 room = most - buffer.backlog_bytes - arrival.size_bytes
                 allowed = [k < len(buffer.slots) for k in range(L)]
@@ -136,14 +136,14 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
             terms = info["reward_terms"]
             total += terms["delivered"], terms["retained"]
             assert reward == terms["retained"]
-        sender, log, n = env.rows.senders.batch.senders[0], env.rows.senders.batch.log[0], info["arrived"]
-        assert n == len(env.rows.senders.episodes[0].arrivals)
+        sender, log, n = env.sub_envs.senders.batch.senders[0], env.sub_envs.senders.batch.log[0], info["arrived"]
+        assert n == len(env.sub_envs.senders.episodes[0].arrivals)
         assert n == info["delivered"] + info["dropped"] + sender["busy"] + sender["occupancy"]
         assert all(same(*observations) for observations in held)  # never written again
         np.testing.assert_allclose(total, max(0.0, info["qoi"] - 1), atol=1e-9)
         # H by its definition, from what crossed.
-        x = env.rows.senders.episodes[0].arrivals["x"][log["transmitted_us"][:n] >= 0]
-        assert info["qoi"] == pytest.approx(env.rows.scenario.value.information(np.sort(x)))
+        x = env.sub_envs.senders.episodes[0].arrivals["x"][log["transmitted_us"][:n] >= 0]
+        assert info["qoi"] == pytest.approx(env.sub_envs.scenario.value.information(np.sort(x)))
     if scenario == "dying":
         assert sender["occupancy"] + sender["busy"] > 0  # stranded, and still all sums hold
 

@@ -33,7 +33,7 @@ def make(case: str = "plain", capacity: int = L, **more: Any) -> SenderEnv:
 
 def waiting(env: SenderEnv) -> int:
     """Who asks: nobody (0), an arrival, or the socket."""
-    return int(env.rows.senders.batch.senders["waiting"][0])
+    return int(env.sub_envs.senders.batch.senders["waiting"][0])
 
 
 def test_fields_of_topics_need_topics() -> None:
@@ -41,7 +41,7 @@ def test_fields_of_topics_need_topics() -> None:
     assert (seen["silence"].shape, seen["socket_asks"].shape) == ((L + 1,), (1,))
     refuse("unknown field 'silence'", SenderEnv, "lte", fields=["silence"])
     # The terms of topics have namesakes there, computed where they are named.
-    assert [term.name for term in SenderEnv("lte", reward="age", actions="slots").rows.terms] == [
+    assert [term.name for term in SenderEnv("lte", reward="age", actions="slots").sub_envs.terms] == [
         "delivered",
         "retained",
         "age",
@@ -96,7 +96,7 @@ def test_an_episode_of_three_topics_by_hand() -> None:
     seen, info = env.reset(options={"episode": three_topics()})
     totals = dict.fromkeys(TERMS, 0.0)
     for k, (who, ms, mask, action, retained, delivered) in enumerate(script):
-        assert (waiting(env), int(env.rows.senders.batch.senders["now_us"][0])) == (who, 1_000 * ms)
+        assert (waiting(env), int(env.sub_envs.senders.batch.senders["now_us"][0])) == (who, 1_000 * ms)
         assert info["action_mask"].tolist() == [bool(each) for each in mask]
         assert seen["socket_asks"] == [who == SOCKET_WAITS]
         assert seen["occupied"].tolist()[-1] == (who == ARRIVAL_WAITS)
@@ -128,7 +128,7 @@ def test_hold_waits_for_the_next_arrival_and_an_invalid_choice_sends_the_oldest(
     env.step(4)
     assert waiting(env) == SOCKET_WAITS  # asked anew: 0 and 1 are queued
     for action, invalid, goes in ((4, 1, 0), (2, 1, 0), (1, 0, 1), (0, 0, 0)):
-        batch = env.rows.senders.batch._replace(senders=env.rows.senders.batch.senders.copy())
+        batch = env.sub_envs.senders.batch._replace(senders=env.sub_envs.senders.batch.senders.copy())
         answer_send(batch, 0, action)
         assert (batch.senders["invalid"][0], batch.senders["chosen"][0]) == (invalid, goes)
 
@@ -150,13 +150,13 @@ def test_rewards_add_up_to_the_outcome_under_random_play(case: str) -> None:
             for name in TERMS:
                 totals[name] += terms[name]
         assert (info["invalid"] > 0) == careless
-        outcomes = topic_outcomes(env.rows.senders, 0)
+        outcomes = topic_outcomes(env.sub_envs.senders, 0)
         assert info["qoi"] == pytest.approx(weights @ [made.qoi for made in outcomes])
         ones = weights @ [made.delivered > 0 for made in outcomes]
         assert totals["delivered"] == pytest.approx(info["qoi"] - ones, abs=1e-9)
         assert totals["retained"] == pytest.approx(info["qoi"] - ones, abs=1e-9)
         assert sum(made.limited for made in outcomes) > 0
-        times = env.rows.senders.episodes[0].arrivals
+        times = env.sub_envs.senders.episodes[0].arrivals
         first_us = [times["arrival_us"][times["topic"] == k][0] for k in range(4)]
         areas = [made.mean_age_s * (times["arrival_us"][-1] - first_us[k]) / 1e6 for k, made in enumerate(outcomes)]
         assert totals["age"] == pytest.approx(-(weights @ areas) / weights.sum())

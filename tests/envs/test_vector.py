@@ -136,7 +136,7 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
     rng, truncations, episodes, questions = np.random.default_rng(1), 0, 0, set()
     for _ in range(steps):
         actions = actions_of(rng, envs)
-        questions.add(frozenset(envs.rows.senders.batch.senders["waiting"].tolist()))
+        questions.add(frozenset(envs.sub_envs.senders.batch.senders["waiting"].tolist()))
         step, expected = envs.step(actions), sync.step(actions)
         for a, b in zip(step[:4], expected[:4], strict=True):
             assert_same(a, b)
@@ -157,7 +157,7 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
             assert_same(envs.action_masks()[i], sync.envs[i].unwrapped.action_masks())
     assert (truncations > 0) == (limit is not None)
     assert limit is not None or episodes >= N or steps < 100
-    if envs.rows.senders.topics and limit is None and steps > 100:  # both kinds of question in one step
+    if envs.sub_envs.senders.topics and limit is None and steps > 100:  # both kinds of question in one step
         assert any({ARRIVAL_WAITS, SOCKET_WAITS} <= kinds for kinds in questions)
 
 
@@ -165,7 +165,7 @@ def check_equal_to_sync(case: str, mode: AutoresetMode, limit: int | None, steps
 def test_threads_change_nothing(case: str) -> None:
     """Three rows in two threads are what they are in one, and more threads than rows are as many."""
     one, two, many = vector(case), vector(case, num_threads=2), vector(case, num_threads=9)
-    assert [len(part) for part in two.rows._threads.parts] == [2, 1] and len(many.rows._threads.parts) == N
+    assert [len(part) for part in two.sub_envs._threads.parts] == [2, 1] and len(many.sub_envs._threads.parts) == N
     for envs in (one, two, many):
         envs.reset(seed=8)
     rng = np.random.default_rng(1)
@@ -309,7 +309,7 @@ test_wrong_use_is_named = refused(
     (lambda: vector("interruption").reset(seed=[1, 2]), "2 seeds for 3"),
     (lambda: begun().reset(options={"reset_mask": np.array([True])}), r"reset_mask'\] is bool\[1\]: must be bool\[3\]"),
     (lambda: begun().reset(options={"reset_mask": np.array([0, 2, 1])}), r"is int64\[3\]: must be bool\[3\]"),
-    (lambda: begun().reset(options={"episodes": [None]}), "must be a list of 3, one a row"),
+    (lambda: begun().reset(options={"episodes": [None]}), "must be a list of 3, one for each environment"),
     (lambda: begun().step(np.array([0, 5, 6])), r"actions\[2\] = 6: must be a whole number in 0\.\.5"),
     (lambda: begun().step(np.array([0, 1.7, 2])), "actions are float64: must be whole numbers", INVALID),
     (lambda: begun().step(np.zeros(N + 1, np.int64)), "shape"),

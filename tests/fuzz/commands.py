@@ -38,10 +38,10 @@ def leave_out_work() -> None:
         raise BufgymError("left out")
 
     for path in WORK.split():
-        module, name = path.rsplit(".", 1)
-        room = importlib.import_module(module)
+        module_name, name = path.rsplit(".", 1)
+        module = importlib.import_module(module_name)
         # A command keeps its options.
-        setattr(room, name, functools.wraps(getattr(room, name))(left_out))
+        setattr(module, name, functools.wraps(getattr(module, name))(left_out))
 
 
 def drawn(uniform: random.Random, command: App) -> list[str]:

@@ -24,7 +24,7 @@ def recordings(link: LinkParameters = KNOWN) -> list[Float64Array]:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """Fits try each memory on some hundred seconds only, but in the night."""
+    """Fits try each memory on some hundred seconds only; nightly ones on all."""
     if request.node.get_closest_marker("nightly") is None:
         monkeypatch.setattr("bufgym.traces.fit._TRIAL_S", 500)
 

@@ -57,13 +57,13 @@ def record(
 
     The k-th episode of a row, and its player in "mixed", is always the same. Shorter episodes come earlier.
     """
-    rows, n = envs.rows, envs.num_envs
-    if rows.senders.topics:
+    sub_envs, n = envs.sub_envs, envs.num_envs
+    if sub_envs.senders.topics:
         raise BufgymError("data sets are made of one queue, not of several topics")
     roles = ("expert", "medium", "random") if kind == "mixed" else (kind,)
     known = {"expert": "clairvoyant", "medium": medium}
     # Among candidates the clairvoyant's plan may not be there: it judges those that are.
-    judges = rows.choices is not None and "expert" in roles
+    judges = sub_envs.choices is not None and "expert" in roles
     players = {
         name: Player(policies.get(known[name]), n)
         for name in roles
@@ -73,22 +73,22 @@ def record(
     envs.reset(seed=seed)
     rng = np.random.default_rng([seed, 1])
     # With a limit B an arrival may ask again after an eviction, at most once more for each message.
-    steps = 2 * rows.scenario.max_messages + 1
-    seen = np.zeros((n, steps, rows.form.numbers), np.float32)
-    masks = np.zeros((n, steps, rows.actions_count), np.int8)
+    steps = 2 * sub_envs.scenario.max_messages + 1
+    seen = np.zeros((n, steps, sub_envs.form.numbers), np.float32)
+    masks = np.zeros((n, steps, sub_envs.actions_count), np.int8)
     numbers = np.zeros((n, steps, 3))  # reward, H, regret
     taken = np.zeros((n, steps), np.int64)
     every, length = np.arange(n), np.zeros(n, np.int64)
     turns = every % len(roles)
     left = np.full(n, episodes // n) + (every < episodes % n)
     while (left > 0).any():
-        output, senders = rows.output, rows.senders
+        output, senders = sub_envs.output, sub_envs.senders
         mask = output.action_mask
-        actions = np.full(n, rows.idle_action)
+        actions = np.full(n, sub_envs.idle_action)
         for turn, name in enumerate(roles):
             mine = every[(turns == turn) & (left > 0)]
             if name in players:
-                actions[mine] = rows.of_slots(players[name].actions(senders, mine))[mine]
+                actions[mine] = sub_envs.of_slots(players[name].actions(senders, mine))[mine]
             elif name == "expert" and judge is not None:
                 actions[mine] = judge.actions()[mine]
             elif len(mine):
@@ -97,17 +97,17 @@ def record(
         numbers[every, length, 1] = output.qoi
         if regret and judge is not None:
             numbers[every, length, 2] = np.nan_to_num(judge.regrets()[every, actions])
-        rows.step(actions)
-        numbers[every, length, 0] = rows.rewards()
+        sub_envs.step(actions)
+        numbers[every, length, 0] = sub_envs.rewards()
         length[left > 0] += 1
-        ended = every[rows.output.terminated & (left > 0)]
+        ended = every[sub_envs.output.terminated & (left > 0)]
         for i in ended.tolist():
             T = int(length[i])
-            seen[i, T], masks[i, T] = rows.output.flat[i], rows.output.action_mask[i]
-            numbers[i, T] = 0.0, rows.output.qoi[i], 0.0
+            seen[i, T], masks[i, T] = sub_envs.output.flat[i], sub_envs.output.action_mask[i]
+            numbers[i, T] = 0.0, sub_envs.output.qoi[i], 0.0
             yield Recorded(
                 roles[turns[i]],
-                rows.form.masked(rows.form.of(seen[i, : T + 1].copy()), masks[i, : T + 1].copy()),
+                sub_envs.form.masked(sub_envs.form.of(seen[i, : T + 1].copy()), masks[i, : T + 1].copy()),
                 taken[i, :T].copy(),
                 numbers[i, :T, 0].copy(),
                 masks[i, : T + 1].copy(),
@@ -115,7 +115,7 @@ def record(
                 numbers[i, : T + 1, 2].copy() if regret else None,
             )
         length[ended], left[ended], turns[ended] = 0, left[ended] - 1, (turns[ended] + 1) % len(roles)
-        rows.reset(ended[left[ended] > 0])
+        sub_envs.reset(ended[left[ended] > 0])
 
 
 def make(

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.expert.experts import rows_of
-from bufgym.envs.fleet_rows import FleetRows
+from bufgym.envs.expert.experts import sub_envs_of
+from bufgym.envs.fleet_sub_envs import FleetSubEnvs
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.utils.errors import BufgymError
 
@@ -22,21 +22,21 @@ class Clairvoyant:
     """
 
     def __init__(self, env: Any) -> None:
-        self.rows = rows_of(env)
-        if isinstance(self.rows, FleetRows):
+        self.sub_envs = sub_envs_of(env)
+        if isinstance(self.sub_envs, FleetSubEnvs):
             raise BufgymError(
                 "expert.clairvoyant: known for one queue with a link of its own, not for robots that share a link"
             )
-        self._hindsight = Hindsight(self.rows.senders, "expert.clairvoyant")
+        self._hindsight = Hindsight(self.sub_envs.senders, "expert.clairvoyant")
 
     def values(self) -> NDArray[np.float64]:
         """float64[n, actions]: the best H still attainable after each action, in hindsight.
 
         NaN for invalid actions and missing candidates, and where no decision is due.
         """
-        rows, shown = self.rows, self.rows.output.action_mask != 0
-        if rows.choices is not None:
-            return self._hindsight.values(np.where(shown, rows.output.slot_actions, -1)).copy()
+        sub_envs, shown = self.sub_envs, self.sub_envs.output.action_mask != 0
+        if sub_envs.choices is not None:
+            return self._hindsight.values(np.where(shown, sub_envs.output.slot_actions, -1)).copy()
         return np.where(shown, self._hindsight.values(), np.nan)
 
     def regrets(self) -> NDArray[np.float64]:
@@ -50,9 +50,9 @@ class Clairvoyant:
 
         Of equal actions accepting comes first, then rejecting, then the oldest slot; among candidates the cheapest.
         """
-        values, rows = self.values(), self.rows
+        values, sub_envs = self.values(), self.sub_envs
         n = values.shape[1]
-        order = np.arange(n) if rows.choices is not None else np.array([n - 1, n - 2, *range(n - 2)])
+        order = np.arange(n) if sub_envs.choices is not None else np.array([n - 1, n - 2, *range(n - 2)])
         known = np.where(np.isnan(values), -np.inf, values)[:, order]
         chosen = order[np.argmax(known >= known.max(axis=1, keepdims=True) - _TIE, axis=1)]
-        return np.asarray(np.where(np.isnan(values).all(axis=1), rows.idle_action, chosen), np.int64)
+        return np.asarray(np.where(np.isnan(values).all(axis=1), sub_envs.idle_action, chosen), np.int64)

@@ -135,7 +135,7 @@ def check(folder, policy, decisions, settings, flags):
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", [*SUPPORTED, *AGENTS])
 def test_it_decides_in_c_as_in_python(name, whole, tmp_path):
-    """A million decisions in the night."""
+    """A million decisions nightly."""
     most = (250_000 if name in AGENTS else 20_000, SETTINGS, []) if whole else (2_000, SETTINGS[3:], ["-O0"])
     check(tmp_path, AGENTS.get(name) or policies.get(name), *most)
 

@@ -44,7 +44,7 @@ def test_what_is_paid_comes_at_the_end() -> None:
     rewards, info = played(env, 0)
     terms = info["reward_terms"]
     assert not any(rewards[:-1]) and rewards[-1] == terms["covered"] > 0
-    log = np.asarray(env.rows.senders.batch.log[0])[: worth.FRAMES]
+    log = np.asarray(env.sub_envs.senders.batch.log[0])[: worth.FRAMES]
     kept = np.flatnonzero(log["transmitted_us"] >= 0)
     assert 20 < len(kept) < worth.FRAMES
     assert terms["covered"] == worth.scene().coverage.share(kept)

@@ -9,20 +9,24 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from bufgym_live.relay.audit import Audit
+from typing import Any, Final, Protocol
 
 STALL_S: Final = 1.0  # Time for one piece of work beyond which the disk is said to stall
 MOST_BYTES: Final = 2**24  # Most bytes that wait; further work is left out
 _WORK_BYTES: Final = 1_000  # memory of a piece of work beside its bytes
 
 
-class Disk:
-    """Work of one part, done in order. The work may log as to an ``Audit``."""
+class EventLog(Protocol):
+    """Takes entries, as the relay's audit log does."""
 
-    def __init__(self, part: str, audit: Audit) -> None:
+    def __call__(self, event: str, **fields: Any) -> None:
+        """Have one entry written."""
+
+
+class Disk:
+    """Work of one part, done in order. It is itself an ``EventLog`` for the work, which runs in another thread."""
+
+    def __init__(self, part: str, audit: EventLog) -> None:
         self.part, self._audit = part, audit
         self._thread = ThreadPoolExecutor(1, part)
         self._loop: asyncio.AbstractEventLoop | None = None

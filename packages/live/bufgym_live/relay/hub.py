@@ -32,7 +32,6 @@ from bufgym_live.robot.tasks import Tasks
 
 if TYPE_CHECKING:
     from bufgym_live.relay.foxglove import Window
-    from bufgym_live.relay.peers import Peers
 
 STATUS: Final = f"/{wire.OWN}/status"
 CONNECTED: Final = "connected"  # State of the connection to the other relays
@@ -64,6 +63,18 @@ class Member(Protocol):
 
     def end(self, why: str) -> None:
         """Close it."""
+
+
+class OtherRelays(Protocol):
+    """The relays that share topics with this one."""
+
+    state: str  # ``CONNECTED``, or why there is no connection
+
+    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
+        """Give them a no_drop message; return whether they may have it, None if that is not known."""
+
+    async def close(self) -> None:
+        """Leave them."""
 
 
 class Hub:
@@ -98,7 +109,7 @@ class Hub:
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
         self._latched: dict[str, Outgoing] = {}
         self._latched_bytes = 0
-        self.peers: Peers | None = None  # the other relays, if it shares topics with any
+        self.peers: OtherRelays | None = None  # the other relays, if it shares topics with any
         for message in self.roster.away():
             self._latch(Outgoing(message))
 

@@ -59,13 +59,13 @@ def compiled(chosen: Policy) -> Policy:
     all policies except user-defined ones.
     """
     with _COMPILING:
-        if not kept(chosen) and compiling(__name__, "fill_cache", chosen.name) < 0:
+        if not is_cached(chosen) and compiling(__name__, "fill_cache", chosen.name) < 0:
             raise BufgymError(f"policy {chosen.name}: stopped while it was compiled")
         _used(chosen)
         return chosen
 
 
-def kept(chosen: Policy) -> bool:
+def is_cached(chosen: Policy) -> bool:
     """Whether the policy is in the compiler's cache; if so, load it."""
     from bufgym.jit import NotCachedError, cached_only
 

@@ -52,14 +52,14 @@ def play(
 
 async def _play(workers: Sequence[programs.Worker]) -> list[Received]:
     link, receiver, sender = workers
-    sender.tell(await receiver.told())
-    await sender.told()  # of a connection
+    sender.send(await receiver.receive())
+    await sender.receive()  # of a connection
     began_s = time.monotonic() + programs.START_S
-    link.tell(began_s)
-    sender.tell(began_s)
-    await sender.told(patience_s=math.inf)  # of the last ack
-    receiver.tell("all is sent")
-    return since(began_s, await receiver.told())
+    link.send(began_s)
+    sender.send(began_s)
+    await sender.receive(patience_s=math.inf)  # of the last ack
+    receiver.send("all is sent")
+    return since(began_s, await receiver.receive())
 
 
 def _receive(tunnel: Tunnel, transport: str, port: int, parent: Connection) -> None:

@@ -29,9 +29,9 @@ def settings(policy: Policy, capacity: int, value: Value, *, topics: Sequence[To
     ``rules`` are ``max_bytes``, ``decide_at``, ``window`` and ``ends_us``.
     """
     values = [None if topic.value is None else _numbers(topic.value) for topic in topics]
-    told = [{**asdict(topic), "value": v} for topic, v in zip(topics, values, strict=True)]
+    described = [{**asdict(topic), "value": v} for topic, v in zip(topics, values, strict=True)]
     ruling = {"policy": policy.name, "parameters": dict(policy.parameters), "capacity": int(capacity)}
-    return {"event": "settings", "us": 0, **ruling, "v": _numbers(value), "topics": told, **rules}
+    return {"event": "settings", "us": 0, **ruling, "v": _numbers(value), "topics": described, **rules}
 
 
 def _numbers(value: Value) -> Record:

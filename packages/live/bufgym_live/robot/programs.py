@@ -46,11 +46,11 @@ class Worker:
         words.close()
         failures.close()
 
-    def tell(self, words: Any) -> None:
+    def send(self, words: Any) -> None:
         """Send words to the program."""
         self._words.send(words)
 
-    async def told(self, patience_s: float = SILENCE_S) -> Any:
+    async def receive(self, patience_s: float = SILENCE_S) -> Any:
         """Wait for the program's next words.
 
         Raises:

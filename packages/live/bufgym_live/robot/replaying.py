@@ -73,8 +73,8 @@ def _arrivals(records: Sequence[Record]) -> np.ndarray[Any, Any]:
 
 def _trace(records: Sequence[Record]) -> Trace:
     """Trace of the bytes carried, with a knot at each arrival and each departure."""
-    told = [record for record in records if "carried" in record]
-    times, counts = np.array([(0, 0), (1, 0), *((record["us"], record["carried"]) for record in told)]).T
+    knots = [record for record in records if "carried" in record]
+    times, counts = np.array([(0, 0), (1, 0), *((record["us"], record["carried"]) for record in knots)]).T
     return Trace("live", times, counts, "stop")
 
 

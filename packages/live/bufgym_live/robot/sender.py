@@ -41,11 +41,11 @@ class Sender:
         queue: PolicyQueue,
         connect: Callable[[], Awaitable[Channel]],
         leaves: Leaves = "sent",
-        told: Callable[[str], None] = lambda fault: None,
+        on_status: Callable[[str], None] = lambda fault: None,
     ) -> None:
         """``connect`` makes a new connection to the receiver at each call.
 
-        ``told`` is called with "" when the receiver has answered, and with the reason when there is no connection,
+        ``on_status`` is called with "" when the receiver has answered, and with the reason when there is no connection,
         once for as long as the reason is the same.
         """
         if leaves not in ("sent", "acked", "written"):
@@ -55,8 +55,8 @@ class Sender:
         """Set while the receiver has answered on this connection."""
         self.faults: deque[str] = deque(maxlen=100)
         """Reasons of the last 100 ends of a connection."""
-        self._connect, self._leaves, self._told = connect, leaves, told
-        self._told_last: str | None = None
+        self._connect, self._leaves, self._on_status = connect, leaves, on_status
+        self._last_status: str | None = None
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
@@ -95,9 +95,9 @@ class Sender:
         self._tell(self.faults[-1])
 
     def _tell(self, fault: str) -> None:
-        if fault != self._told_last:
-            self._told_last = fault
-            self._told(fault)
+        if fault != self._last_status:
+            self._last_status = fault
+            self._on_status(fault)
 
     async def _talk(self, channel: Channel) -> None:
         """Greet, then send until all is done."""

@@ -203,7 +203,7 @@ def test_a_viewer_chooses_the_policy_and_plays_a_recording(browser: Any, port: i
         cards = "document.querySelectorAll('.card').length >= 2"
         until(page, f"{cards} && document.querySelector('#policy').value === 'drop-oldest'")
         page.select_option("#policy", "drop-newest")
-        until(page, "document.querySelector('#told').textContent.endsWith('done')")
+        until(page, "document.querySelector('#command-status').textContent.endsWith('done')")
         until(page, "document.querySelector('#policy').value === 'drop-newest'")
         page.click("#recordings")
         page.click("#files li button")

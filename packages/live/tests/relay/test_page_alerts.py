@@ -82,7 +82,7 @@ def test_an_emergency_stop_is_on_top_of_200_alerts_and_of_a_recording(browser: A
         before = len(fleet.came)
         assert page.is_enabled("#stop") and page.is_hidden("#goal")
         page.keyboard.press("x")
-        until(page, f"{text('#told')} === 'stop: amr-04 answers: done'")
+        until(page, f"{text('#command-status')} === 'stop: amr-04 answers: done'")
         assert [said["command"] for said in fleet.came[before:]] == ["stop"]
         page.click("#notices p:first-child a")  # an alert is of now
         until(page, f"{text('#state')} === 'live'", f"{text('#name')} === 'low-7'")

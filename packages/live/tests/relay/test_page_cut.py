@@ -88,7 +88,7 @@ def browser() -> Iterator[Any]:
         yield one
 
 
-STATE, TOLD = text("#state"), text("#told")
+STATE, COMMAND = text("#state"), text("#command-status")
 
 
 def test_a_frozen_link_is_not_live_and_a_stop_is_kept_for_it(browser: Any, stage: Stage) -> None:
@@ -105,16 +105,16 @@ def test_a_frozen_link_is_not_live_and_a_stop_is_kept_for_it(browser: Any, stage
         assert time.monotonic() - began_s < 3.5  # 3 s, and what the test itself takes
         until(page, "document.querySelector('#goal').hidden", "!document.querySelector('#cover').hidden")
         page.keyboard.press("x")
-        until(page, f"{TOLD} === 'stop: kept: car stops as soon as it can be reached'")
+        until(page, f"{COMMAND} === 'stop: kept: car stops as soon as it can be reached'")
         assert stage.car.names[before:] == []
         until(page, f"{STATE} === 'not connected' || {STATE} === 'connecting'")
         stage.do(stage.link.thaw)
-        until(page, f"{STATE} === 'live'", f"{TOLD} === 'stop: car answers: done'")
+        until(page, f"{STATE} === 'live'", f"{COMMAND} === 'stop: car answers: done'")
         assert stage.car.names[before:] == ["stop"]
         assert page.evaluate(text("#notices span")).startswith("refused: goal: withdrawn by a stop")
         until(page, f"{text('.says')}.includes('stopped by page-')")
         page.click("#release")
-        until(page, f"{TOLD} === 'release: car answers: done'", "document.querySelector('#release').hidden")
+        until(page, f"{COMMAND} === 'release: car answers: done'", "document.querySelector('#release').hidden")
 
 
 def test_what_a_break_left_unconfirmed_is_asked_for_again(browser: Any, stage: Stage) -> None:
@@ -131,7 +131,7 @@ def test_what_a_break_left_unconfirmed_is_asked_for_again(browser: Any, stage: S
         until(page, f"{STATE} === 'live'", "!document.querySelector('#goal').hidden")
         assert len(stage.car.names) == before
         page.click("#notices button:has-text('Send again')")
-        until(page, f"{TOLD} === 'goal: car answers: done'")
+        until(page, f"{COMMAND} === 'goal: car answers: done'")
         assert stage.car.names[before:] == ["goal"]
 
 

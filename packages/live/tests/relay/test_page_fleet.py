@@ -225,8 +225,8 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
     until(page, f"{text('#stop')} === 'Stop one'", f"{text('#facts')} !== ''")
     assert page.is_hidden("#pose")
     page.click("#stop")
-    until(page, f"{text('#told')} === 'stop: one answers: done'")
-    for aside, told in ((60, "goal: one answers: done"), (160, "goal: one answers: refused")):
+    until(page, f"{text('#command-status')} === 'stop: one answers: done'")
+    for aside, status in ((60, "goal: one answers: done"), (160, "goal: one answers: refused")):
         page.click("#goal")
         page.evaluate("document.querySelector('#map').scrollIntoView()")
         box = page.locator("#map").bounding_box()
@@ -235,7 +235,7 @@ def test_commands_by_hand(opened: tuple[Any, Fleet]) -> None:
         page.mouse.down()
         page.mouse.move(x, y - 50)
         page.mouse.up()
-        until(page, f"{text('#told')} === '{told}'")
+        until(page, f"{text('#command-status')} === '{status}'")
     stop, near, _ = fleet.came
     assert (stop["command"], near["command"], near["frame"]) == ("stop", "goal", "map")
     assert near["yaw"] == pytest.approx(np.pi / 2, abs=0.01) and near["y"] == pytest.approx(0, abs=0.1)

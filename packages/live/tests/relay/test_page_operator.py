@@ -78,7 +78,7 @@ def test_all_robots_stop_at_a_second_press(browser: Any) -> None:
         assert fleet.came == []
         page.click("#stop-all")
         page.click("#stop-all")
-        until(page, f"{text('#told')} === 'stop: 3 of 3 robots have confirmed'")
+        until(page, f"{text('#command-status')} === 'stop: 3 of 3 robots have confirmed'")
         assert [said["command"] for said in fleet.came] == ["stop"] * 3
 
 
@@ -89,10 +89,10 @@ def test_a_goal_by_keys(browser: Any) -> None:
         until(page, f"{text('#facts')} !== ''", "!document.querySelector('#goal').hidden")
         page.focus("#goal")
         page.keyboard.press("Enter")
-        until(page, f"{text('#told')}.includes('arrows, Enter')", "document.activeElement.id === 'map'")
+        until(page, f"{text('#command-status')}.includes('arrows, Enter')", "document.activeElement.id === 'map'")
         for key in ("ArrowRight", "ArrowRight", "ArrowUp", "Enter", *["ArrowLeft"] * 6, "Enter"):
             page.keyboard.press(key)
-        until(page, f"{text('#told')} === 'goal: one answers: done'")
+        until(page, f"{text('#command-status')} === 'goal: one answers: done'")
         (said,) = fleet.came
         assert said["x"] == pytest.approx(2 * said["y"], abs=2e-3) and said["y"] > 0
         assert said["yaw"] == pytest.approx(np.pi / 2, abs=1e-3)

@@ -169,7 +169,7 @@ def test_all_can_be_done_by_keys(running: tuple[Any, Fleet]) -> None:
     page.fill("#search", "")
     page.focus("#map")
     page.keyboard.press("x")
-    until(page, f"{text('#told')} === 'stop: one answers: done'")
+    until(page, f"{text('#command-status')} === 'stop: one answers: done'")
     assert [said["command"] for said in fleet.came] == ["stop"]
     page.close()
 

@@ -1,6 +1,6 @@
 """Robofleet's Algorithm 3: a table of every kind of rule, and random rules against ten lines that say the same.
 
-A hundred configurations in a commit; ten thousand in the night.
+A hundred configurations in a commit; ten thousand nightly.
 """
 
 import contextlib
@@ -103,8 +103,8 @@ class Ear:
         self.subscriptions = {"a": Subscription("a", pattern(".*"), policies.policy("drop-oldest"), 1)}
         self.came: set[str] = set()
 
-    def offer(self, subscription: Subscription, frame: Outgoing) -> None:
-        self.came.add(frame.message.topic)
+    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
+        self.came.add(outgoing.message.topic)
 
 
 def test_random_rules_as_the_reference() -> None:

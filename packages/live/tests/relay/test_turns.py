@@ -73,8 +73,8 @@ async def test_what_is_latched_is_offered_in_turns(monkeypatch: pytest.MonkeyPat
     """All others have a turn after 256 topics; one that gets a newer message meanwhile comes once, with that."""
     others, came = Others(), list[tuple[int, str, bytes]]()
 
-    def offer(connection: Connection, subscription: Subscription, frame: Outgoing) -> None:
-        message = frame.message
+    def offer(connection: Connection, subscription: Subscription, outgoing: Outgoing) -> None:
+        message = outgoing.message
         came.append((others.turn, message.topic, bytes(message.payload)))
         if len(came) == 1:
             one.hub.publish(None, wire.Message("/map/999", b"new", "raw"))

@@ -1,6 +1,6 @@
 """Whatever untrusted clients send, the relay goes on, lets nothing in, and says so in its audit log.
 
-A hundred of each in a commit; ten thousand in the night.
+A hundred of each in a commit; ten thousand nightly.
 """
 
 import asyncio

@@ -37,8 +37,8 @@ def main() -> None:
         base.hear(name, 10)
     odd: list[bytes] = []
     base.node.create_subscription(ODD, "/odd", odd.append, 10, raw=True)
-    told: list[Any] = []
-    robot.node.create_subscription(DiagnosticArray, "/diagnostics", told.append, 10)
+    arrays: list[Any] = []
+    robot.node.create_subscription(DiagnosticArray, "/diagnostics", arrays.append, 10)
     try:
         renamed = ("-r", "/front/camera:=/robot1/camera", "-r", "__node:=bufgym_receive_1")
         there = start(BASE, "receive", "--port", "0", "--ros-args", *renamed).rpartition(" ")[2]
@@ -53,7 +53,7 @@ def main() -> None:
             ends_s = time.monotonic() + 60
             while not holds():
                 if time.monotonic() > ends_s:
-                    raise TimeoutError(f"waited 60 s for {what}; came: {base.came}, {odd}, {told}")
+                    raise TimeoutError(f"waited 60 s for {what}; came: {base.came}, {odd}, {arrays}")
                 for name, publisher in publishers.items() if publish else ():
                     text = String(data=name)
                     publisher.publish(serialize_message(text) if name == "/odd" else text)
@@ -62,8 +62,8 @@ def main() -> None:
                 base.spin()
 
         spin("a message of each topic", lambda: all(base.came.values()) and bool(odd), publish=True)
-        told.clear()
-        spin("diagnostics", lambda: bool(told))
+        arrays.clear()
+        spin("diagnostics", lambda: bool(arrays))
         [seen] = base.node.get_publishers_info_by_topic("/robot1/camera")
         qos = seen.qos_profile
         [asked] = robot.node.get_subscriptions_info_by_topic("/odd")
@@ -76,7 +76,7 @@ def main() -> None:
         result["qos"] = [time.nanoseconds / 1e9 for time in times], qos.liveliness.name
         result["diagnostics"] = [
             [one.name, one.message, {pair.key: float(pair.value) for pair in one.values}]
-            for array in told[:1]
+            for array in arrays[:1]
             for one in array.status
         ]
         print(json.dumps(result), flush=True)

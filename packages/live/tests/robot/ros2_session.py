@@ -84,8 +84,8 @@ def main(folder: str) -> None:
         there = start(BASE, "receive", "--port", "0").rpartition(" ")[2]
         back = start(ROBOT, "receive", "--port", "0").rpartition(" ")[2]
         log = ["--policies", "fifo", "--log", str(Path(folder, "log.mcap"))]
-        told = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
-        told_back = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back)
+        line = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
+        line_back = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back)
         own = Publisher(robot.node, String, "own/echo", to=("127.0.0.1", int(there.rpartition(":")[2])))
         came = base.came | robot.came
 
@@ -121,7 +121,7 @@ def main(folder: str) -> None:
         spin("the last picture", lambda: last("camera") == 99, 2.0, must=False)
         own.destroy(1.0)
         quality = base.node.get_publishers_info_by_topic("/camera")[0]
-        seen = {"came": came, "told": [told, told_back], "by": quality.node_name, "faults": list(own.sender.faults)}
+        seen = {"came": came, "lines": [line, line_back], "by": quality.node_name, "faults": list(own.sender.faults)}
         seen["best_effort"] = quality.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         print(json.dumps(seen), flush=True)
         for process in processes:

@@ -64,10 +64,10 @@ def test_send_to_nobody_says_so() -> None:
     code = f"from bufgym.cli import main; main(['live', 'send', '{place}', '--size', '10', '--duration', '0.5'])"
     with subprocess.Popen([sys.executable, "-uc", code], stdout=subprocess.PIPE, text=True) as sending:
         assert sending.stdout is not None
-        told = [sending.stdout.readline(), sending.stdout.readline()]
+        lines = [sending.stdout.readline(), sending.stdout.readline()]
         sending.kill()
-    assert told[0] == "   0 s: 1 put, 0 dropped, 0 queued\n"  # it is still being asked
-    assert told[1].startswith("9 messages wait for the receiver") and "ConnectionRefusedError" in told[1]
+    assert lines[0] == "   0 s: 1 put, 0 dropped, 0 queued\n"  # it is still being asked
+    assert lines[1].startswith("9 messages wait for the receiver") and "ConnectionRefusedError" in lines[1]
 
 
 def test_validate_keeps_its_runs(tmp_path: Path) -> None:
@@ -121,9 +121,11 @@ def test_a_log_by_hand(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     """
     records = story().records
     text = View(records).text()
-    told = numbers(text)
-    assert told["socket"] == [1] and told["put"] == [6, 6, 0.6] and told["left"][-1] == 0.1 and told["QoI"] == [1, 0]
-    assert told["dropped"] == [3, 3, 0.3, 3] and "[#.]   the oldest 0.05 s" in text
+    found = numbers(text)
+    assert (
+        found["socket"] == [1] and found["put"] == [6, 6, 0.6] and found["left"][-1] == 0.1 and found["QoI"] == [1, 0]
+    )
+    assert found["dropped"] == [3, 3, 0.3, 3] and "[#.]   the oldest 0.05 s" in text
     for cut in range(1, len(records)):  # wherever a log breaks off
         View(records[:cut]).text()
     with LogFile(tmp_path / "log.mcap") as file:

@@ -53,11 +53,11 @@ def ends(_: Connection) -> None:
 def test_a_program_is_spoken_to_and_may_be_silent_and_who_waits_hears_that_another_has_failed() -> None:
     for work, words in ((fails, "other: no such thing"), (ends, "other: has ended")):
         with running(echo=echoes, other=work) as (echo, _), pytest.raises(BufgymError, match=words):
-            asyncio.run(echo.told())
+            asyncio.run(echo.receive())
     with running(echo=echoes) as (echo,):
-        echo.tell({"port": 3})
-        assert asyncio.run(echo.told()) == {"port": 3}
-        refuse(r"echo: said nothing for 0\.01 s", asyncio.run, echo.told(patience_s=0.01))
+        echo.send({"port": 3})
+        assert asyncio.run(echo.receive()) == {"port": 3}
+        refuse(r"echo: said nothing for 0\.01 s", asyncio.run, echo.receive(patience_s=0.01))
 
 
 PARENT = """
@@ -76,8 +76,8 @@ with running(idle=lambda parent: threading.Event().wait()):
 def test_no_program_outlives_a_parent_that_was_killed(begins_after_s: str) -> None:
     """Nor where the parent was gone before the program had begun."""
     words = [sys.executable, "-c", PARENT, begins_after_s]
-    told = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)
-    state = Path(f"/proc/{int(told.stdout)}/stat")
+    printed = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)
+    state = Path(f"/proc/{int(printed.stdout)}/stat")
     with contextlib.suppress(FileNotFoundError):
         for _ in range(600):
             if state.read_text().rpartition(")")[2].split()[0] == "Z":  # ended, but nobody has asked for it
@@ -185,8 +185,8 @@ def test_the_command_says_how_far_it_is(
 
     monkeypatch.setattr(Reproduction, "LIVE", {**Reproduction.LIVE, **SMALL["robofleet-fig5"], "live": 8.0})
     assert main(["reproduce", "robofleet-fig5", "--live", "--out", str(tmp_path)]) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("robofleet-fig5: ")]
-    assert told == [
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("robofleet-fig5: ")]
+    assert lines == [
         "robofleet-fig5: 4 runs on real sockets take about 1 s",  # 2 s, four programs, eight times as fast
         *(f"robofleet-fig5: run {k} of 4" for k in (1, 2, 3, 4)),
     ]

@@ -36,8 +36,8 @@ FADE = REPO / "examples" / "ros1" / "fade.py"
 @pytest.mark.nightly
 def test_a_policy_in_an_untouched_node(ros: dict[str, str]) -> None:
     """6 s with a fade of 1.5 s. Over 20 s, quiet machine: H 1.47 times that of rospy's own queue, the gap a tenth."""
-    told = [played(ros, FADE, "--one", policy, "--seconds", 6) for policy in ("rospy", "afr")]
-    stock, afr = (json.loads(out.splitlines()[-1]) for out in told)
+    printed = [played(ros, FADE, "--one", policy, "--seconds", 6) for policy in ("rospy", "afr")]
+    stock, afr = (json.loads(out.splitlines()[-1]) for out in printed)
     assert afr["longest_gap"] < stock["longest_gap"]  # what a busy machine does not turn round
 
 
@@ -94,8 +94,8 @@ def test_the_command_names_what_is_wrong(topics: Any, capsys: pytest.CaptureFixt
         (["--value", "round:1", __file__], "round"),
     ):
         assert command(options) == 2
-        told = capsys.readouterr().err
-        assert told.startswith("bufgym_live.robot.ros1: error: ") and words in told and told.count("\n") == 1
+        printed = capsys.readouterr().err
+        assert printed.startswith("bufgym_live.robot.ros1: error: ") and words in printed and printed.count("\n") == 1
 
 
 def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> None:

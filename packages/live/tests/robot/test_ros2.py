@@ -64,7 +64,7 @@ def test_topics_cross_as_they_are_and_commands_come_back(tmp_path: Path) -> None
     pictures = seen["came"].pop("camera")
     assert len(pictures) >= 90 and pictures == [number for number in numbers if number in pictures]  # best effort
     assert seen["came"] == {"status": ["up"], "own/echo": numbers, "commands": numbers[::10]}
-    assert seen["told"][1] == "/commands: std_msgs/msg/String, reliable"
+    assert seen["lines"][1] == "/commands: std_msgs/msg/String, reliable"
     assert seen["best_effort"] and seen["by"] == "bufgym_receive" and seen["faults"] == []
     log = read_log(tmp_path / "log.mcap")
     assert log[0]["policy"] == "fifo" and replay(log).differences == ()
@@ -83,11 +83,11 @@ def test_the_relay_takes_ros_2s_own_words() -> None:
     assert seen["odd"] == "/odd" and seen["types"] == ["no_such_msgs/msg/Thing"]
     assert seen["by"] == ["/bufgym_receive_1", "/robot/bufgym_send"]
     assert seen["qos"] == [[50, 60, 70], "MANUAL_BY_TOPIC"] and seen["reliability"] == "BEST_EFFORT"
-    told = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
+    statuses = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
     topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
-    assert told.pop("/robot/bufgym_send: uplink") == ("connected", {})
-    assert set(told) == {f"/robot/bufgym_send: {name}" for name in topics}
-    for message, numbers in told.values():
+    assert statuses.pop("/robot/bufgym_send: uplink") == ("connected", {})
+    assert set(statuses) == {f"/robot/bufgym_send: {name}" for name in topics}
+    for message, numbers in statuses.values():
         assert message == "connected" and numbers["arrived"] == numbers["left"] >= 1
         assert numbers["QoI"] == pytest.approx(1 + 0.382 * (numbers["left"] - 1))
 
@@ -116,8 +116,8 @@ def test_what_is_no_message_of_a_relay_ends_the_connection(body: bytes) -> None:
 def test_diagnostics_by_hand() -> None:
     """Two topics in 4 s: of three messages of the first one is dropped, one has left, one waits for 3 s."""
     now_s = [0.0]
-    told = Diagnostics([exponential(0.5)] * 2, clock=lambda: now_s[0])
-    queue = PolicyQueue("drop-oldest", 1, topics=[Topic("a"), Topic("b")], log=told, value=exponential(0.5))
+    diagnostics = Diagnostics([exponential(0.5)] * 2, clock=lambda: now_s[0])
+    queue = PolicyQueue("drop-oldest", 1, topics=[Topic("a"), Topic("b")], log=diagnostics, value=exponential(0.5))
     queue.put("goes", 500_000, 0.0, 0)
     queue.put("is dropped", 500_000, 1.0, 0)
     now_s[0] = 1.0
@@ -125,7 +125,7 @@ def test_diagnostics_by_hand() -> None:
     queue.get()
     queue.gone()
     now_s[0] = 4.0
-    first, second = told.tell()
+    first, second = diagnostics.tell()
     assert first == {
         **{"arrived": 3, "left": 1, "dropped": 1, "queued": 0, "oldest s": 0.0, "QoI": 1.0},
         **{"arrived per s": 0.75, "left per s": 0.25, "left Mbit/s": 1.0},
@@ -135,7 +135,7 @@ def test_diagnostics_by_hand() -> None:
     queue.get()
     queue.gone()
     now_s[0] = 6.0
-    first, _ = told.tell()
+    first, _ = diagnostics.tell()
     assert (first["left"], first["QoI"], first["left per s"]) == (2, 1.75, 0.5)  # 1 + V(2)
 
 
@@ -209,7 +209,7 @@ async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwi
     seen = [None, camera, None, *[replace(camera, reliable=False)] * 2]
     made: list[Published] = []
     gone: list[Published] = []
-    told: list[str] = []
+    said: list[str] = []
     ended = asyncio.Event()
 
     def published(node: Any, name: str, but_not: str) -> Published | None:
@@ -226,11 +226,11 @@ async def test_a_topic_is_subscribed_again_when_its_publisher_comes_back_otherwi
     monkeypatch.setattr(relay, "published", published)
     monkeypatch.setattr(relay, "LOOK_S", 0.0)
     node = SimpleNamespace(destroy_subscription=gone.append)
-    looking = asyncio.create_task(relay.look(node, lambda: ["/odd", "/camera"], found, "me", told.append))
+    looking = asyncio.create_task(relay.look(node, lambda: ["/odd", "/camera"], found, "me", said.append))
     await asyncio.wait_for(ended.wait(), 10)
     looking.cancel()
     assert [topic.reliable for topic in made] == [True, False] and gone == [camera]
-    assert told == ["/odd: left out: topic /odd: messages of no_such_msgs/msg/B, which is not installed here"]
+    assert said == ["/odd: left out: topic /odd: messages of no_such_msgs/msg/B, which is not installed here"]
 
 
 @pytest.mark.filterwarnings("ignore:module 'sre_")  # a parser of rclpy's imports what Python calls deprecated

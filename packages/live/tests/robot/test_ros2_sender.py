@@ -92,7 +92,7 @@ async def talking(talker: Path, *words: object) -> AsyncIterator[Process]:
         await process.communicate()
 
 
-async def told(process: Process, command: str | None = None) -> dict[str, float]:
+async def reply(process: Process, command: str | None = None) -> dict[str, float]:
     """What the program says next: nothing once it has put all, its numbers at its end."""
     if command is not None:
         assert process.stdin is not None
@@ -123,8 +123,8 @@ async def test_every_decision_is_the_simulators(policy: str, talker: Path, tmp_p
         link = ShapedLink(Link(Trace.constant(1e6, duration_s=1)), ("127.0.0.1", port))
         try:
             async with talking(talker, "127.0.0.1", await link.listen(), policy, 5, tmp_path, 150, 40_000, 100) as one:
-                assert await told(one) == {}
-                numbers = await told(one, "end")
+                assert await reply(one) == {}
+                numbers = await reply(one, "end")
         finally:
             await link.close()
     assert in_order(came) and [one.seq for one in came] == gone(tmp_path / "camera-0.jsonl")
@@ -142,13 +142,13 @@ async def test_a_link_cut_and_back(talker: Path, tmp_path: Path) -> None:
         try:
             where = "127.0.0.1", await link.listen()
             async with talking(talker, *where, "drop-oldest", 4, tmp_path, 20, 5000, 100) as one:
-                assert await told(one) == {}
+                assert await reply(one) == {}
                 await until(lambda: came and came[-1].seq == 19)  # a late program puts in bursts, which drop
                 link.cut()
-                assert await told(one, "again") == {}
+                assert await reply(one, "again") == {}
                 link.mend()
                 await until(lambda: came[-1].seq == 39)
-                numbers = await told(one, "end")
+                numbers = await reply(one, "end")
         finally:
             await link.close()
     assert in_order(came)
@@ -164,10 +164,10 @@ async def test_another_receiver_goes_on_where_the_first_was(talker: Path, tmp_pa
         receiving() as (_, other, second),
         talking(talker, "127.0.0.1", port, "drop-oldest", 64, tmp_path, 20, 100_000, 200) as one,
     ):
-        assert await told(one) == {}
+        assert await reply(one) == {}
         await until(lambda: len(first) == 20)
-        assert await told(one, f"move {other}") == {}
-        numbers = await told(one, "end")
+        assert await reply(one, f"move {other}") == {}
+        numbers = await reply(one, "end")
     assert {one.seq for one in first + second} == set(range(40)) and len(second) >= 20 and numbers["faults"] == 0
     assert [b.number - a.number for a, b in itertools.pairwise(second)] == [1] * (len(second) - 1)
 
@@ -176,7 +176,7 @@ async def test_no_receiver_costs_what_the_queue_drops(talker: Path, tmp_path: Pa
     async with receiving() as (receiver, port, _):
         await receiver.close()
         async with talking(talker, "127.0.0.1", port, "drop-oldest", 4, tmp_path, 30, 100, 1000) as one:
-            assert await told(one) == {}
+            assert await reply(one) == {}
             records = read_log(tmp_path / "camera-0.jsonl")
     assert [r["seq"] for r in records if r["event"] == "dropped"] == list(range(1, 26))
 

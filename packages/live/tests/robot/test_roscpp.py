@@ -90,8 +90,8 @@ def ended(process: "subprocess.Popen[str]") -> str:
 def preload(built: Path, log: Path, **settings: str) -> dict[str, str]:
     """Settings of a node: the library, a log, local subscribers too, and these."""
     log.mkdir(exist_ok=True)
-    told = {f"BUFGYM_{name}": word for name, word in {"LOG": str(log), "LOCAL": "1", **settings}.items()}
-    return {"LD_PRELOAD": str(built / "libbufgym_roscpp.so"), **told}
+    variables = {f"BUFGYM_{name}": word for name, word in {"LOG": str(log), "LOCAL": "1", **settings}.items()}
+    return {"LD_PRELOAD": str(built / "libbufgym_roscpp.so"), **variables}
 
 
 def logs(folder: Path) -> list[Path]:

@@ -250,11 +250,11 @@ for k in range(40):
         queue.gone()
 print("numba" in sys.modules)
 """
-    told = [
+    printed = [
         subprocess.run(
             [sys.executable, "-c", code.format(compiled=compiled)], capture_output=True, text=True, check=True
         ).stdout.split()
         for compiled in (False, True)
     ]
-    assert told[0][-1] == "False" and told[1][-1] == "True"
-    assert told[0][:-1] == told[1][:-1] and len(told[0]) > 10
+    assert printed[0][-1] == "False" and printed[1][-1] == "True"
+    assert printed[0][:-1] == printed[1][:-1] and len(printed[0]) > 10

@@ -79,7 +79,7 @@ export class Hand {
       this.map.canvas.focus({preventScroll: true});
       this.tell(`${robot.name}: press where, drag to where it shall look; or arrows, Enter, arrows, Enter; Escape ends it`, "aim");
     }
-    else if (this.told === "aim") this.tell("");
+    else if (this.statusKind === "aim") this.tell("");
   }
 
   aimed(kind, robot, at) {
@@ -89,8 +89,8 @@ export class Hand {
   }
 
   tell(text, what = "") {
-    this.told = what;
-    say(this.$("told"), text);
+    this.statusKind = what;
+    say(this.$("command-status"), text);
   }
 
   // A robot that knows stops hears this as soon as it can be reached, before all else, and stands until somebody releases it.
@@ -180,7 +180,7 @@ export class Hand {
     this.drive.offer(ways.drive && isLive && !robot.away ? robot : null);
     this.$("remove").hidden = isOff || !robot.away || !this.relay.mayCommand(`/robots/${robot.name}/last`);
     if (this.map.tool && !(ways[this.map.tool.kind] && isLive)) this.take(null);
-    if (this.told === "aim") return;
+    if (this.statusKind === "aim") return;
     const {sent, all} = this;
     if (!sent && all) return this.tell(`stop: ${all.count - all.open.size} of ${all.count} robots have confirmed`, "sent");
     this.tell(sent && sent.robot === robot ? `${sent.kind}: ${sent.doneMs ? `${robot.name} answers: ${sent.state}` : this.waits(robot) ?? sent.state}` : "", "sent");

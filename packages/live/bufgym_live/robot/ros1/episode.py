@@ -66,20 +66,20 @@ def play(
 
 async def _play(workers: Sequence[programs.Worker], episode: Episode) -> list[Received]:
     viewer, camera, *carrier = workers
-    camera.tell(await viewer.told())  # where the master is
+    camera.send(await viewer.receive())  # where the master is
     link = None
     try:
         if not carrier:
-            link = ShapedLink(episode.link, await viewer.told(), back=True)
-            viewer.tell(await link.listen())
-        await camera.told()
+            link = ShapedLink(episode.link, await viewer.receive(), back=True)
+            viewer.send(await link.listen())
+        await camera.receive()
         began_s = time.monotonic() + programs.START_S
         if link is not None:
             asyncio.get_running_loop().call_at(began_s, link.begin)
         for worker in (*carrier, camera):
-            worker.tell(began_s)
-        viewer.tell(await camera.told(patience_s=math.inf))
-        return programs.received(await viewer.told(patience_s=math.inf), episode, began_s)
+            worker.send(began_s)
+        viewer.send(await camera.receive(patience_s=math.inf))
+        return programs.received(await viewer.receive(patience_s=math.inf), episode, began_s)
     finally:
         if link is not None:
             await link.close()

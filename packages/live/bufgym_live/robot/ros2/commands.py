@@ -65,15 +65,15 @@ async def send(
     with contextlib.ExitStack() as stack:
         node = stack.enter_context(own_node(SENDER, ros_args))
         options = {"policy": policies or "", "value": "", "capacity": capacity, "odometry": odom or ""}
-        told = _parameters(node, {"topics": [""], **options, "host": host, "port": port})
+        parameters = _parameters(node, {"topics": [""], **options, "host": host, "port": port})
         robot = RosSender(
             client,
-            *address(host_port(told["host"], told["port"])),
-            topics=[name for name in told["topics"] if name],
-            policy=one_policy(told["policy"], policy_file) if told["policy"] else None,
-            capacity=told["capacity"],
-            value=qoi.load(told["value"]) if told["value"] else None,
-            odometry=told["odometry"] or None,
+            *address(host_port(parameters["host"], parameters["port"])),
+            topics=[name for name in parameters["topics"] if name],
+            policy=one_policy(parameters["policy"], policy_file) if parameters["policy"] else None,
+            capacity=parameters["capacity"],
+            value=qoi.load(parameters["value"]) if parameters["value"] else None,
+            odometry=parameters["odometry"] or None,
             transport=transport,
             window=window,
             backoff_s=backoff,
@@ -85,7 +85,7 @@ async def send(
 
 _ABOUT = {
     "topics": "Names, or patterns with * and ?, besides the topics in --config",
-    "policy": "Which message goes when the queue is full; empty: afr for one topic, learned-scheduler for several",
+    "policy": "Drops messages when the queue is full; empty: afr for one topic, learned-scheduler for several",
     "value": "V of topics without one, as exponential:0.618 or saturating:4",
     "capacity": "L, messages of all topics together",
     "odometry": "Topic with poses, which gives x to the topics that move",
@@ -100,14 +100,14 @@ def _parameters(node: Any, defaults: Mapping[str, Any]) -> dict[str, Any]:
     from rcl_interfaces.msg import ParameterDescriptor
     from rclpy.exceptions import ParameterException
 
-    told = {}
+    parameters = {}
     for name, default in defaults.items():
         try:
             about = ParameterDescriptor(description=_ABOUT[name], read_only=True)
-            told[name] = node.declare_parameter(name, default, about).value
+            parameters[name] = node.declare_parameter(name, default, about).value
         except ParameterException as error:
             raise BufgymError(f"parameter {name}: {error}") from None
-    return told
+    return parameters
 
 
 async def receive(

@@ -32,8 +32,8 @@ class Diagnostics:
         """``values`` has V of each topic."""
         self._values, self._clock = values, clock
         self._numbers = [Numbers() for _ in values]
-        self._told = [Numbers() for _ in values]
-        self._told_s = clock()
+        self._returned = [Numbers() for _ in values]
+        self._returned_s = clock()
         self._present: dict[int, tuple[float, Record]] = {}  # puts of messages queued or in the socket, by seq
         self._socket: set[int] = set()
         self._lock = threading.Lock()
@@ -67,12 +67,12 @@ class Diagnostics:
         """Each topic's numbers by name; rates are over the time since the last call."""
         with self._lock:
             now_s = self._clock()
-            passed_s = max(1e-6, now_s - self._told_s)
+            passed_s = max(1e-6, now_s - self._returned_s)
             waiting = [(at_s, put["topic"]) for seq, (at_s, put) in self._present.items() if seq not in self._socket]
-            told = []
-            for k, (now, before) in enumerate(zip(self._numbers, self._told, strict=True)):
+            statuses = []
+            for k, (now, before) in enumerate(zip(self._numbers, self._returned, strict=True)):
                 ages = [now_s - at_s for at_s, topic in waiting if topic == k]
-                told.append(
+                statuses.append(
                     {
                         "arrived per s": (now.arrived - before.arrived) / passed_s,
                         "left per s": (now.left - before.left) / passed_s,
@@ -85,9 +85,9 @@ class Diagnostics:
                         "QoI": now.qoi,
                     }
                 )
-                self._told[k] = Numbers(**vars(now))
-            self._told_s = now_s
-            return told
+                self._returned[k] = Numbers(**vars(now))
+            self._returned_s = now_s
+            return statuses
 
 
 def publisher(node: Any, say: Callable[[str], None]) -> Callable[[Mapping[str, dict[str, float]], str], None]:
@@ -102,11 +102,11 @@ def publisher(node: Any, say: Callable[[str], None]) -> Callable[[Mapping[str, d
     def publish(numbers: Mapping[str, dict[str, float]], fault: str) -> None:
         array = messages.DiagnosticArray()
         array.header.stamp = node.get_clock().now().to_msg()
-        for name, told in {"uplink": {}, **numbers}.items():
+        for name, values in {"uplink": {}, **numbers}.items():
             one = messages.DiagnosticStatus(name=f"{node.get_fully_qualified_name()}: {name}", hardware_id="bufgym")
             one.level = one.WARN if fault else one.OK
             one.message = fault or "connected"
-            one.values = [messages.KeyValue(key=key, value=f"{number:g}") for key, number in told.items()]
+            one.values = [messages.KeyValue(key=key, value=f"{number:g}") for key, number in values.items()]
             array.status.append(one)
         published.publish(array)
 

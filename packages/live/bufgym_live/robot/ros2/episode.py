@@ -79,19 +79,19 @@ def play(
 
 async def _play(workers: Sequence[programs.Worker], episode: Episode, address: str) -> list[Received]:
     receiving, sending, viewer, camera, *carrier = workers
-    to = address, await receiving.told()
+    to = address, await receiving.receive()
     link = None if carrier else ShapedLink(episode.link, to)
     try:
-        sending.tell(to if link is None else (address, await link.listen()))
-        await viewer.told()  # of a frame before the first
+        sending.send(to if link is None else (address, await link.listen()))
+        await viewer.receive()  # of a frame before the first
         began_s = time.monotonic() + programs.START_S
         if link is not None:
             asyncio.get_running_loop().call_at(began_s, link.begin)
         for worker in (*carrier, camera):
-            worker.tell(began_s)
-        sending.tell(await camera.told(patience_s=math.inf))
-        viewer.tell(await sending.told(patience_s=math.inf))
-        return programs.received(await viewer.told(), episode, began_s)
+            worker.send(began_s)
+        sending.send(await camera.receive(patience_s=math.inf))
+        viewer.send(await sending.receive(patience_s=math.inf))
+        return programs.received(await viewer.receive(), episode, began_s)
     finally:
         if link is not None:
             await link.close()

@@ -197,7 +197,7 @@ class RosSender:
             await asyncio.sleep(TELL_S)
             numbers = zip(self._places, self._diagnostics.tell(), strict=True)
             fault = f"not connected to {self._to}: {self._fault}" if self._fault else ""
-            publish({place.name: told for place, told in numbers if place.name is not None}, fault)
+            publish({place.name: values for place, values in numbers if place.name is not None}, fault)
 
     def _names(self, node: Any) -> list[str]:
         """Names of the topics to look for; topics that a pattern fits take one of its places."""

@@ -46,7 +46,7 @@ public:
         "Topics to send, also patterns with * and ?; relative names stand in the namespace");
     declare("host", std::string("127.0.0.1"), "Where bufgym ros2 receive listens; may change at any time");
     declare("port", 7410, "Its port; may change at any time", 1, 65535);
-    declare("policy", std::string("learned"), "Which message goes when a queue is full: " + known());
+    declare("policy", std::string("learned"), "Which message is dropped when a queue is full: " + known());
     declare("value", std::string(), "V, one for all nodes of the process: exponential:BASE or saturating:DISTANCE");
     declare("capacity", 15, "L, messages of each queue; also the depth of the subscription", 1, MOST);
     declare(
@@ -295,11 +295,11 @@ private:
       status.hardware_id = "bufgym";
       status.level = n.connected ? status.OK : status.WARN;
       status.message = n.connected ? "connected" : "not connected: " + n.fault;
-      const std::pair<const char *, double> told[] = {
+      const std::pair<const char *, double> values[] = {
           {"arrived per s", n.arrived_hz}, {"left per s", n.left_hz}, {"left Mbit/s", n.left_mbps},
           {"arrived", double(n.arrived)},  {"left", double(n.left)},  {"dropped", double(n.dropped)},
           {"queued", double(n.queued)},    {"oldest s", n.oldest_s},  {"QoI", n.qoi}};
-      for (const auto &[key, number] : told)
+      for (const auto &[key, number] : values)
       {
         diagnostic_msgs::msg::KeyValue pair;
         pair.key = key;

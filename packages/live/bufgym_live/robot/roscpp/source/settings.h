@@ -100,9 +100,9 @@ private:
     std::string key = "~bufgym_";
     for (char c : name)
       key += c == '_' ? c : char(c + 32);
-    XmlRpc::XmlRpcValue told;  // roslaunch makes numbers of what looks like them
+    XmlRpc::XmlRpcValue value;  // roslaunch makes numbers of what looks like them
     std::ostringstream written;
-    return ros::param::get(key, told) ? (written << told, written.str()) : otherwise;
+    return ros::param::get(key, value) ? (written << value, written.str()) : otherwise;
   }
 
   static const Policy *named(const std::string &name)

@@ -1,6 +1,6 @@
-"""Rows, the base of every environment: n senders, the arrays they return, and one compiled step over all of them.
+"""SubEnvs, the base of every environment: n senders, the arrays they return, and one compiled step over all of them.
 
-``Rows`` has a link for each sender; in ``fleet_rows`` the robots of a cell share one.
+``SubEnvs`` has a link for each sender; in ``fleet_sub_envs`` the robots of a cell share one.
 """
 
 import math
@@ -56,7 +56,7 @@ def check_entries(names: Iterable[str], known: Sequence[str], place: str) -> Non
             raise unknown("entry", name, known, place=place)
 
 
-class Rows:
+class SubEnvs:
     """n senders, each with its own random streams, stepped together.
 
     ``output``, a ``StepOutput``, has the results of the last step. ``rewarded``, float64[n, reward terms], sums each
@@ -171,7 +171,7 @@ class Rows:
         )
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
-        """Give row ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
+        """Give sub-environment ``i`` streams of its own, derived from the generator that Gymnasium seeded."""
         self.streams[i] = Streams.seeded(int(rng.integers(2**63)))
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
@@ -186,7 +186,7 @@ class Rows:
             self._own_fields.write(self.senders.batch, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
-        """Take one decision in every row; the result is in ``self.output``."""
+        """Take one decision in every sub-environment; the result is in ``self.output``."""
         if (rows := self._threads.all) is not None:
             self._run(rows, actions)
         else:
@@ -203,7 +203,9 @@ class Rows:
         An episode may be a dict of arguments for ``numbered``.
         """
         if episodes is not None and (not isinstance(episodes, Sequence) or len(episodes) != len(self)):
-            raise BufgymError(f"episodes = {episodes!r}: must be a list of {len(self)}, one a row; None to draw one")
+            raise BufgymError(
+                f"episodes = {episodes!r}: must be a list of {len(self)}, one for each environment; None to draw one"
+            )
         begun: list[Begun] = []
         for i in rows.tolist():
             given = None if episodes is None else episodes[i]
@@ -234,8 +236,8 @@ class Rows:
         return rewards
 
     def summary(self, i: Any) -> dict[str, Any]:
-        """QoI and message counts so far in row(s) ``i``, an index or several."""
-        senders = self.senders.batch.senders  # indexing it first would copy each row's whole record
+        """QoI and message counts so far in sub-environment(s) ``i``, an index or several."""
+        senders = self.senders.batch.senders  # indexing it first would copy each sender's whole record
         return {
             "qoi": self.output.qoi[i],
             "arrived": senders["next"][i],
@@ -245,7 +247,7 @@ class Rows:
         }
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of row ``i`` after a reset or a step; see ``INFOS``."""
+        """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``INFOS``."""
         info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
         if self.choices is not None and self._shows_mask:
             info["slots"] = self.output.slot_actions[i].copy()
@@ -262,7 +264,7 @@ class Rows:
         return info
 
     def observation(self, i: int | None = None) -> Observation:
-        """The present observation of all rows, as views of ``output``; of row ``i`` alone, as a copy."""
+        """The present observation of all, as views of ``output``; of sub-environment ``i`` alone, as a copy."""
         if i is None:
             return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
         observation = self._handed.of(self.output.flat[i])
@@ -297,7 +299,7 @@ class Rows:
         return np.where(meant.any(axis=1), meant.argmax(axis=1), cheapest)
 
     def actions(self, actions: Any) -> NDArray[np.int64]:
-        """Convert one action for each row to the kernels' form; the error names the first row that is wrong."""
+        """Convert one action for each sub-environment to the kernels' form; the error names the first that is wrong."""
         if self._acts:
             return self._acts.take("actions", actions)
         numbers = np.asarray(actions)
@@ -313,11 +315,11 @@ class Rows:
         return numbers
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """bool[n, actions]: the actions valid now in each row."""
+        """bool[n, actions]: the actions valid now in each sub-environment."""
         return self.output.action_mask.astype(np.bool_)
 
     def bounds(self, ended: NDArray[np.bool_], qoi: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-        """Name -> float64[n]: ``measured`` for the rows that have ``ended`` with this H; 0 elsewhere."""
+        """Name -> float64[n]: ``measured`` for those that have ``ended`` with this H; 0 elsewhere."""
         columns = {name: np.zeros(len(self)) for name in MEASURED}
         for i in np.flatnonzero(ended).tolist():
             for name, number in measured(self.senders, i, float(qoi[i])).items():
@@ -333,7 +335,7 @@ class Rows:
         return InvalidActionError(f"{name} = {action!r}: {rule}")
 
     def _next_episode(self, i: int) -> tuple[Any, np.random.Generator]:
-        """The next episode of row ``i``'s streams, and the generator of its uniform draws."""
+        """The next episode of sub-environment ``i``'s streams, and the generator of its uniform draws."""
         if (streams := self.streams[i]) is None:
             self.seed(i, seeding.np_random()[0])
             return self._next_episode(i)

@@ -1,4 +1,4 @@
-"""Rows whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
+"""Sub-environments whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
 
 from collections.abc import Sequence
 from typing import Any, cast
@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.options import SLOTS, Options, read_arguments
-from bufgym.envs.rows import Rows
 from bufgym.envs.step import step_cells
+from bufgym.envs.sub_envs import SubEnvs
 from bufgym.envs.vector import SenderVectorEnv
 from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink
@@ -17,10 +17,10 @@ from bufgym.utils.errors import BufgymError
 from bufgym.utils.threads import Threads
 
 
-class FleetRows(Rows):
-    """``cells`` cells with N = ``scenario.robots`` robots each. Robot r of cell c is row c N + r.
+class FleetSubEnvs(SubEnvs):
+    """``cells`` cells with N = ``scenario.robots`` robots each. Robot r of cell c is sub-environment c N + r.
 
-    The robots of a cell begin an episode together; it is drawn from the streams of the cell's first row.
+    The robots of a cell begin an episode together; it is drawn from the streams of the cell's first robot.
     """
 
     keeps_slots = True  # for a state of all fields
@@ -38,7 +38,7 @@ class FleetRows(Rows):
         self._threads = Threads(np.arange(cells), options.num_threads)
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
-        """Give row ``i`` streams of its own if it is the first of its cell; other rows need none."""
+        """Give robot ``i`` streams of its own if it is the first of its cell; the others need none."""
         if i % self.robots == 0:
             super().seed(i, rng)
 
@@ -63,23 +63,24 @@ class FleetRows(Rows):
         step_cells(self.senders.batch, self.fleet.shares, rows, actions, self.rewarded, self.output, self.form.named)
 
     def rewards(self) -> NDArray[np.float64]:
-        """float64[rows]: each robot's own weighted sum, or for a "team" the mean within its cell."""
+        """float64[n]: each robot's own weighted sum, or for a "team" the mean within its cell."""
         own = super().rewards()
         if self.reward == "own":
             return own
         return np.repeat(own.reshape(len(self.fleet), self.robots).mean(axis=1), self.robots)
 
 
-def fleet_rows(
+def fleet_sub_envs(
     cells: int, scenario: FleetScenario, *, reward: str = "team", term: Any = Options.reward, **arguments: Any
-) -> FleetRows:
-    """Make the rows of ``cells`` cells from the arguments of a fleet's environment; see ``FleetEnv``."""
+) -> FleetSubEnvs:
+    """Make the sub-environments of ``cells`` cells from the arguments of a fleet's environment; see ``FleetEnv``."""
     uplink, options = read_arguments(scenario.uplink, reward=term, **{"actions": SLOTS, **arguments})
-    return FleetRows(cells, FleetScenario.of(scenario.robots, cast(Uplink, uplink)), options, reward)
+    return FleetSubEnvs(cells, FleetScenario.of(scenario.robots, cast(Uplink, uplink)), options, reward)
 
 
 class FleetVecEnv(SenderVectorEnv):
-    """``cells`` cells with N ``robots`` each, as a batch of cells x N environments. Robot r of cell c is row c N + r.
+    """``cells`` cells with N ``robots`` each, as a batch of cells x N environments. Robot r of cell c is
+    environment c N + r.
 
     Any learner for one robot thus trains weights that all robots of a fleet share, each deciding from its own
     observation:
@@ -90,7 +91,7 @@ class FleetVecEnv(SenderVectorEnv):
         envs = GymVecEnv(FleetVecEnv(cells=16, robots=4, autoreset_mode="SameStep"))
         MaskablePPO("MultiInputPolicy", envs).learn(1_000_000)
 
-    **Action, observation, episode end** of each row and the other arguments are as in ``SenderVectorEnv``, with these
+    **Action, observation, episode end** of each robot and the other arguments are as in ``SenderVectorEnv``, with these
     differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.
     ``options["episodes"]`` holds a ``FleetEpisode`` for each cell.
 
@@ -109,5 +110,5 @@ class FleetVecEnv(SenderVectorEnv):
         fleet: Any = FleetScenario.of(robots, scenario)
         super().__init__(whole("cells", cells, 1), fleet, capacity, **arguments)
 
-    def _make_rows(self, n: int, scenario: Any, **arguments: Any) -> Rows:
-        return fleet_rows(n, scenario, **arguments)
+    def _make_sub_envs(self, n: int, scenario: Any, **arguments: Any) -> SubEnvs:
+        return fleet_sub_envs(n, scenario, **arguments)
