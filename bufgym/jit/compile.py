@@ -1,10 +1,9 @@
-"""The one decorator for compiled functions, and what Python calls them by."""
+"""The decorator for compiled functions, with the pipeline."""
 
 import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-import numba
 from numba.core import types
 from numba.core.registry import CPUDispatcher
 from numba.experimental.function_type import _get_wrapper_address
@@ -61,35 +60,6 @@ def compile_signature(signature: Any, function: Function) -> Function:
     # Another signature is then an error, and not a second, silent compilation.
     compiled.disable_compile()
     return cast(Function, compiled)
-
-
-def entry_point_of(compiled: Any) -> Any:
-    """The plain code of a ``compile_signature`` result, for callers that pass exactly the types of its signature.
-
-    To find the code for its arguments, Numba looks at every array of every tuple at each call: 3 us, and ten times that
-    with functions among them. Here nobody looks, so wrong types go unnoticed.
-    """
-    (overload,) = compiled.overloads.values()
-    return overload.entry_point
-
-
-def without_dispatch(compiled: Any) -> Any:
-    """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments.
-
-    It has three arguments or more. Calls with equal ``batch.several``, and None as the same of the last three
-    arguments, have arguments of equal types.
-    """
-    entries: dict[tuple[bool | None, bool, bool, bool], Any] = {}
-
-    @functools.wraps(compiled.py_func)
-    def call(*arguments: Any) -> Any:
-        kind = arguments[0].several, arguments[-1] is None, arguments[-2] is None, arguments[-3] is None
-        if kind not in entries:
-            entries[kind] = compiled.compile(tuple(map(cast(Any, numba).typeof, arguments)))
-        return entries[kind](*arguments)
-
-    cast(Any, call).py_func = compiled.py_func
-    return call
 
 
 class _Located(types.WrapperAddressProtocol):

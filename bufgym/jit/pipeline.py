@@ -4,7 +4,6 @@ See docs/methods.md, "Kernels in parts".
 """
 
 import operator
-import threading
 from typing import Any, cast
 
 from numba import types
@@ -39,17 +38,15 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
         """Compile ``function``; Numba calls it with its compiler's lock held."""
         if self.state.flags.forceinline:
             return super().compile_extra(function)
-        notice = threading.Timer(announce.PATIENCE_S, announce.say)
-        numbas, notice.daemon = cast(Any, config), True
+        numbas = cast(Any, config)
         level = numbas.OPT
-        notice.start()
-        try:
-            # A global of Numba's, safe to set while the compiler's lock is held.
-            numbas.OPT = 2  # LLVM's level; 3 takes longer, and the code is no faster
-            result = super().compile_extra(function)
-        finally:
-            numbas.OPT = level
-            notice.cancel()
+        with announce.if_long():
+            try:
+                # A global of Numba's, safe to set while the compiler's lock is held.
+                numbas.OPT = 2  # LLVM's level; 3 takes longer, and the code is no faster
+                result = super().compile_extra(function)
+            finally:
+                numbas.OPT = level
         for environment in result._find_referenced_environments():  # of Python objects that parts use, such as texts
             result.codegen.set_env(environment.env_name, environment)
         return result

@@ -14,7 +14,7 @@ import pytest
 from needs import needs
 from numpy.typing import NDArray
 
-from bufgym.jit import JIT, announce, cache, interruptible, kernel, without_dispatch
+from bufgym.jit import JIT, announce, interruptible, kernel, without_dispatch
 
 TALE = """
 import os
