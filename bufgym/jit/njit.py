@@ -8,23 +8,39 @@ import functools
 import shutil
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 import numba.extending
 from llvmlite import binding
+from numba.core import compiler, untyped_passes
 
 from bufgym.jit import announce
 from bufgym.jit.folder import CACHED_ONLY, CACHED_VERSIONS, FOLDER, NotCachedError, readable_name, state
+from bufgym.jit.none_fields import NoneFields
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _numba: Any = numba  # It has no types.
 
+_Compiler: Any = compiler.CompilerBase
+
+
+class _PlainCompiler(_Compiler):  # type: ignore[misc]
+    """Numba's own passes, and ``NoneFields`` before all that look at types."""
+
+    def define_pipelines(self) -> list[Any]:
+        """All passes, in order."""
+        passes = cast(Any, compiler).DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.add_pass_after(NoneFields, untyped_passes.IRProcessing)
+        passes.finalize()
+        return [passes]
+
+
 # As in ``compile``, which says why.
-_OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "pipeline_class": _PlainCompiler}
 _PART = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _CPU = binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()
 _FOLDER_LOCK = threading.Lock()
@@ -71,10 +87,13 @@ def _cached(dispatcher: Any, role: str) -> Any:
     name = readable_name(function, role)
 
     def compile_cached(signature: Any) -> Any:
+        if tuple(getattr(signature, "args", signature)) in dispatcher.overloads:
+            return compile_uncached(signature)
         folder = Path(FOLDER, f"{name}-{state(function, signature, _CPU)}")
-        if not any(folder.rglob("*.nbc")) and CACHED_ONLY.get():
+        is_cached = any(folder.rglob("*.nbc"))
+        if CACHED_ONLY.get() and not is_cached:
             raise NotCachedError
-        with announce.if_long(), warnings.catch_warnings():
+        with contextlib.nullcontext() if is_cached else announce.if_long(), warnings.catch_warnings():
             warnings.simplefilter("ignore", _numba.core.errors.NumbaWarning)  # of code that cannot be cached
             try:
                 _use(folder, dispatcher)

@@ -14,6 +14,7 @@ import pytest
 from needs import needs
 from numpy.typing import NDArray
 
+from bufgym import jit
 from bufgym.jit import JIT, announce, interruptible, kernel, without_dispatch
 
 TALE = """
@@ -36,7 +37,7 @@ def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str
     """Run ``source``, a module whose kernels print 42."""
     file = tmp_path / "tale.py"
     file.write_text(source.format(before=before))
-    environment = {"PYTHONPATH": str(Path(cache.__file__).parents[3]), **os.environ, **environment}
+    environment = {"PYTHONPATH": str(Path(jit.__file__).parents[3]), **os.environ, **environment}
     done = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "42\n"
