@@ -24,13 +24,13 @@ from bufgym.jit.way import COMPILER, JIT, PIPELINE
 if JIT:
     from bufgym.jit import indexing  # noqa: F401  (teaches Numba)
     from bufgym.jit.announce import compile_silently
-    from bufgym.jit.calls import entry_point_of, without_dispatch
+    from bufgym.jit.calls import entry_point_of, with_address, without_dispatch
     from bufgym.jit.folder import FOLDER, NotCachedError, cached_only
 
     if COMPILER == PIPELINE:
-        from bufgym.jit.compile import compile_signature, kernel, with_address
+        from bufgym.jit.compile import compile_signature, kernel
     else:
-        from bufgym.jit.njit import compile_signature, kernel, with_address  # type: ignore[assignment]
+        from bufgym.jit.njit import compile_signature, kernel  # type: ignore[assignment]
 else:
     from bufgym.jit.uncompiled import (  # type: ignore[assignment]
         FOLDER,

@@ -1,9 +1,10 @@
-"""Ways to call compiled functions without Numba's look at the types of their arguments."""
+"""Short ways to call compiled functions, without Numba's look at them or at the types of their arguments."""
 
 import functools
 from typing import Any, cast
 
 import numba
+from numba.core import types
 
 
 def entry_point_of(compiled: Any) -> Any:
@@ -33,3 +34,28 @@ def without_dispatch(compiled: Any) -> Any:
 
     cast(Any, call).py_func = compiled.py_func
     return call
+
+
+class _Located(types.WrapperAddressProtocol):
+    """A compiled function together with the address of its machine code."""
+
+    def __init__(self, signature: Any, compiled: Any) -> None:
+        self._numba_type_ = types.FunctionType(signature)
+        self._signature = signature
+        self._compiled = compiled  # the address is valid only as long as this lives
+        (overload,) = compiled.overloads.values()
+        self._address = int(overload.library.get_pointer_to_function(overload.fndesc.llvm_cfunc_wrapper_name))
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def signature(self) -> Any:
+        return self._signature
+
+
+def with_address(signature: Any, compiled: Any) -> Any:
+    """A ``compile_signature`` result for short calls: Numba looks up its address here, not at each call.
+
+    That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
+    """
+    return _Located(signature, compiled)

@@ -6,7 +6,6 @@ from typing import Any, TypeVar, cast
 
 from numba.core import types
 from numba.core.registry import CPUDispatcher
-from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.jit.cache import Code
 from bufgym.jit.pipeline import KernelCompiler
@@ -60,27 +59,3 @@ def compile_signature(signature: Any, function: Function) -> Function:
     # Another signature is then an error, and not a second, silent compilation.
     compiled.disable_compile()
     return cast(Function, compiled)
-
-
-class _Located(types.WrapperAddressProtocol):
-    """A compiled function together with the address of its machine code."""
-
-    def __init__(self, signature: Any, compiled: Any) -> None:
-        self._numba_type_ = types.FunctionType(signature)
-        self._signature = signature
-        self._compiled = compiled  # the address is valid only as long as this lives
-        self._address = int(cast(Any, _get_wrapper_address)(compiled, signature))
-
-    def __wrapper_address__(self) -> int:
-        return self._address
-
-    def signature(self) -> Any:
-        return self._signature
-
-
-def with_address(signature: Any, compiled: Any) -> Any:
-    """A ``compile_signature`` result for short calls: Numba looks up its address here, not at each call.
-
-    That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
-    """
-    return _Located(signature, compiled)

@@ -1,6 +1,6 @@
 """The decorator for compiled functions, with plain Numba: for versions that the pipeline does not know.
 
-Only names that Numba documents are used. See docs/methods.md, "Kernels in parts".
+It keeps to what Numba documents, options apart. See docs/methods.md, "Kernels in parts".
 """
 
 import contextlib
@@ -147,8 +147,3 @@ def compile_signature(signature: Any, function: Function) -> Function:
     # Another signature is then an error, and not a second, silent compilation.
     compiled.disable_compile()
     return cast(Function, compiled)
-
-
-def with_address(signature: Any, compiled: Any) -> Any:
-    """A ``compile_signature`` result for short calls: itself, as no documented name of Numba's gives its address."""
-    return compiled
