@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from bufgym.jit.way import JIT
 
-
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
