@@ -30,7 +30,7 @@ if JIT:
     if COMPILER == PIPELINE:
         from bufgym.jit.compile import compile_signature, kernel
     else:
-        from bufgym.jit.njit import compile_signature, kernel  # type: ignore[assignment]
+        from bufgym.jit.njit import compile_signature, kernel
 else:
     from bufgym.jit.uncompiled import (  # type: ignore[assignment]
         FOLDER,

@@ -72,10 +72,12 @@ class _Kernel:
         return kernel, (self.py_func,)
 
 
-@_numba.extending.typeof_impl.register(_Kernel)
 def _type_in_kernels(compiled: _Kernel, _: Any) -> Any:
     """Numba's type of a kernel in a kernel that calls it."""
     return _numba.typeof(compiled.part)
+
+
+_numba.extending.typeof_impl.register(_Kernel)(_type_in_kernels)
 
 
 def _cached(dispatcher: Any, role: str) -> Any:
