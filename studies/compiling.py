@@ -1,11 +1,11 @@
-"""What compilation costs: lines of the kernel's base, the first step of a batch without and with kept code, staleness.
+"""What compilation costs in each way: its lines, the first step of a batch without and with kept code, staleness.
 
-``python -m studies.compiling [--repeats N]``
+``python -m studies.compiling [--compiler plain] [--repeats N]``
 
-A new process makes each figure. Its time is the processor's, from the start of Python to the first step of 64 rows of
-``Uplink-v0``. Python's bytecode is kept in a folder of this command, as installed packages keep theirs. With
-``PYTHONDONTWRITEBYTECODE=1`` and no bytecode beside the packages, every process translates 800 modules anew. That takes
-another second.
+The ways are the pipeline in Numba's compiler and plain Numba (``BUFGYM_COMPILER``). A process makes each figure. Its
+time is the processor's, from the start of Python to the first step of 64 rows of ``Uplink-v0``. Python's bytecode is
+kept in a folder of this command, as installed packages keep theirs. With ``PYTHONDONTWRITEBYTECODE=1`` and no bytecode
+beside the packages, every process translates 800 modules anew. That takes another second.
 
 At last a copy of the package is edited, several calls below the kernel that Python calls. The copy finds the machine
 code of the original and must not run it. Its observations must equal those of the same text as plain Python.
@@ -20,8 +20,10 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 from bufgym.cli.options import Count
+from bufgym.jit.way import PIPELINE, PLAIN, VARIABLE
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import PACKAGE
 from bufgym.utils.tables import Table
@@ -42,11 +44,11 @@ total = observation.sum(dtype=float)
 for _ in range(40):
     observation, *_, info = batch.step(info["action_mask"].argmax(axis=1))
     total += observation.sum(dtype=float)
-best_s, reject = float("inf"), numpy.full({ROWS}, 8)
+best_s, evict = float("inf"), numpy.zeros({ROWS}, int)
 for _ in range({{repeats}}):
     began_s = time.process_time()
     for _ in range(100):
-        batch.step(reject)
+        batch.step(evict)
     best_s = min(best_s, time.process_time() - began_s)
 print(first_s, best_s / 100 / {ROWS} * 1e9, total)
 """
@@ -54,6 +56,20 @@ print(first_s, best_s / 100 / {ROWS} * 1e9, total)
 
 EDITED, TEXT, EDIT = Path("model", "qoi.py"), "1.0 - math.exp(d * v[1])", "0.5 * (1.0 - math.exp(d * v[1]))"
 """A file, the text in it that V is computed by, and another that halves V. A step reaches it by several calls."""
+
+
+MODULES = {PIPELINE: ("pipeline", "compile", "cache"), PLAIN: ("njit",)}
+"""Way to compile -> the modules of ``bufgym/jit`` that it alone has."""
+ROWS_OF_TABLE = (
+    "lines of its own in bufgym/jit",
+    f"first step of {ROWS} rows, nothing kept",
+    f"first step of {ROWS} rows, code kept",
+    "a step of one of these rows",
+    "sum of observations before the edit",
+    "the same after it, compiled",
+    "the same after it, as plain Python",
+    "stale code was run",
+)
 
 
 def run(
@@ -87,36 +103,44 @@ def edited(folder: Path) -> Path:
     return copy
 
 
-def lines() -> int:
-    """Lines of the kernel's base."""
-    files = (PACKAGE / "jit").glob("*.py")
+def lines(compiler: str) -> int:
+    """Lines that this way alone has."""
+    files = (PACKAGE / "jit" / f"{name}.py" for name in MODULES[compiler])
     return sum(len(file.read_text(encoding="utf-8").splitlines()) for file in files)
 
 
-def main(*, repeats: Count = 3) -> None:
+def measured(compiler: str, repeats: int) -> list[str]:
+    """What one way costs, a text for each of ``ROWS_OF_TABLE``."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, way = Path(name), {VARIABLE: compiler}
+        run(PACKAGE, folder, 0, **way)  # writes bytecode
+        cold = min(run(PACKAGE, folder, 0, f"cold{k}", **way)[0] for k in range(repeats))
+        warm = [run(PACKAGE, folder, 20, **way) for _ in range(repeats)]
+        copy = edited(folder)
+        compiled, uncompiled = run(copy, folder, 0, **way)[2], run(copy, folder, 0, NUMBA_DISABLE_JIT="1")[2]
+    return [
+        str(lines(compiler)),
+        f"{cold:.2f} s",
+        f"{min(first_s for first_s, _, _ in warm):.2f} s",
+        f"{min(step_ns for _, step_ns, _ in warm):.0f} ns",
+        f"{warm[0][2]:.6f}",
+        f"{compiled:.6f}",
+        f"{uncompiled:.6f}",
+        "no" if compiled == uncompiled != warm[0][2] else "YES",
+    ]
+
+
+def main(*, compiler: Literal["pipeline", "plain"] | None = None, repeats: Count = 3) -> None:
     """Measure what compilation costs on this machine, and whether an edit ever runs stale code.
 
     Args:
+        compiler: Measure this way alone.
         repeats: Best of so many.
     """
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        run(PACKAGE, folder, 0)  # writes bytecode
-        cold = min(run(PACKAGE, folder, 0, f"cold{k}")[0] for k in range(repeats))
-        warm = [run(PACKAGE, folder, 20) for _ in range(repeats)]
-        copy = edited(folder)
-        compiled, plain = run(copy, folder, 0)[2], run(copy, folder, 0, NUMBA_DISABLE_JIT="1")[2]
-    rows = [
-        ["lines of bufgym/jit", str(lines())],
-        [f"first step of {ROWS} rows, nothing kept", f"{cold:.2f} s"],
-        [f"first step of {ROWS} rows, code kept", f"{min(first_s for first_s, _, _ in warm):.2f} s"],
-        ["a step of one of these rows", f"{min(step_ns for _, step_ns, _ in warm):.0f} ns"],
-        ["sum of observations before the edit", f"{warm[0][2]:.6f}"],
-        ["the same after it, compiled", f"{compiled:.6f}"],
-        ["the same after it, as plain Python", f"{plain:.6f}"],
-        ["stale code was run", "no" if compiled == plain != warm[0][2] else "YES"],
-    ]
-    print(Table(["", "measured"], [("", rows)]).plain())
+    chosen = [compiler] if compiler else list(MODULES)
+    columns = [measured(one, repeats) for one in chosen]
+    rows = [[what, *texts] for what, *texts in zip(ROWS_OF_TABLE, *columns, strict=True)]
+    print(Table(["", *chosen], [("", rows)]).plain())
 
 
 if __name__ == "__main__":

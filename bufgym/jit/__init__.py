@@ -3,10 +3,11 @@
 A *kernel* is a plain Python function over arrays that the caller owns. Numba compiles it on its first call and keeps
 the machine code on disk; with ``NUMBA_DISABLE_JIT=1`` the same source runs as ordinary Python, and Numba is not even
 imported. That is how the tests check the compiled code against its own text, and how a small robot runs a policy.
+
+Numba compiles by our own ``pipeline``, or, in versions that it does not know, by ``njit`` alone (see ``way``).
 """
 
 from bufgym.jit.arrays import (
-    JIT,
     Floats,
     Ints,
     named,
@@ -18,14 +19,20 @@ from bufgym.jit.arrays import (
     unchecked_table,
 )
 from bufgym.jit.interrupt import interruptible
+from bufgym.jit.way import COMPILER, JIT, PIPELINE
 
 if JIT:
     from bufgym.jit import indexing  # noqa: F401  (teaches Numba)
     from bufgym.jit.announce import compile_silently
-    from bufgym.jit.cache import FOLDER, NotCachedError, cached_only
-    from bufgym.jit.compile import compile_signature, entry_point_of, kernel, with_address, without_dispatch
+    from bufgym.jit.calls import entry_point_of, with_address, without_dispatch
+    from bufgym.jit.folder import FOLDER, NotCachedError, cached_only
+
+    if COMPILER == PIPELINE:
+        from bufgym.jit.compile import compile_signature, kernel
+    else:
+        from bufgym.jit.njit import compile_signature, kernel
 else:
-    from bufgym.jit.plain import (  # type: ignore[assignment]
+    from bufgym.jit.uncompiled import (  # type: ignore[assignment]
         FOLDER,
         NotCachedError,
         cached_only,

@@ -4,23 +4,12 @@ The caller guarantees that indices are >= 0 and slices lie inside the array. Num
 every index and the ends of every slice, which is a fifth of a rollout's instructions.
 """
 
-import os
-import sys
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-
-def _compiles() -> bool:
-    # A program may have switched it off in Numba's settings, which then count and not the environment.
-    if "numba" in sys.modules:
-        return not sys.modules["numba"].config.DISABLE_JIT
-    return os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
-
-
-JIT = _compiles()
-"""False where compilation is off and every kernel runs as its Python source."""
+from bufgym.jit.way import JIT
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

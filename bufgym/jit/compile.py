@@ -1,13 +1,11 @@
-"""The one decorator for compiled functions, and what Python calls them by."""
+"""The decorator for compiled functions, with the pipeline."""
 
 import functools
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-import numba
 from numba.core import types
 from numba.core.registry import CPUDispatcher
-from numba.experimental.function_type import _get_wrapper_address
 
 from bufgym.jit.cache import Code
 from bufgym.jit.pipeline import KernelCompiler
@@ -61,56 +59,3 @@ def compile_signature(signature: Any, function: Function) -> Function:
     # Another signature is then an error, and not a second, silent compilation.
     compiled.disable_compile()
     return cast(Function, compiled)
-
-
-def entry_point_of(compiled: Any) -> Any:
-    """The plain code of a ``compile_signature`` result, for callers that pass exactly the types of its signature.
-
-    To find the code for its arguments, Numba looks at every array of every tuple at each call: 3 us, and ten times that
-    with functions among them. Here nobody looks, so wrong types go unnoticed.
-    """
-    (overload,) = compiled.overloads.values()
-    return overload.entry_point
-
-
-def without_dispatch(compiled: Any) -> Any:
-    """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments.
-
-    It has three arguments or more. Calls with equal ``batch.several``, and None as the same of the last three
-    arguments, have arguments of equal types.
-    """
-    entries: dict[tuple[bool | None, bool, bool, bool], Any] = {}
-
-    @functools.wraps(compiled.py_func)
-    def call(*arguments: Any) -> Any:
-        kind = arguments[0].several, arguments[-1] is None, arguments[-2] is None, arguments[-3] is None
-        if kind not in entries:
-            entries[kind] = compiled.compile(tuple(map(cast(Any, numba).typeof, arguments)))
-        return entries[kind](*arguments)
-
-    cast(Any, call).py_func = compiled.py_func
-    return call
-
-
-class _Located(types.WrapperAddressProtocol):
-    """A compiled function together with the address of its machine code."""
-
-    def __init__(self, signature: Any, compiled: Any) -> None:
-        self._numba_type_ = types.FunctionType(signature)
-        self._signature = signature
-        self._compiled = compiled  # the address is valid only as long as this lives
-        self._address = int(cast(Any, _get_wrapper_address)(compiled, signature))
-
-    def __wrapper_address__(self) -> int:
-        return self._address
-
-    def signature(self) -> Any:
-        return self._signature
-
-
-def with_address(signature: Any, compiled: Any) -> Any:
-    """A ``compile_signature`` result for short calls: Numba looks up its address here, not at each call.
-
-    That saves 0.1 ms a function; in return the kernel's calls of it are slower, by a few ns.
-    """
-    return _Located(signature, compiled)

@@ -1,4 +1,7 @@
-"""Code of the functions of ``arrays`` in kernels: without the checks that Numba adds to every index."""
+"""Code of the functions of ``arrays`` in kernels: without the checks that Numba adds to every index.
+
+It keeps to what Numba's documentation of extensions shows, and so serves versions that the pipeline does not know.
+"""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -7,45 +10,59 @@ import numba
 import numba.extending
 from llvmlite import ir
 from numba.core import cgutils
-from numba.np import arrayobj
 
 from bufgym.jit.arrays import prefetch, unchecked_at, unchecked_item, unchecked_slice, unchecked_table
 
+_BYTE = ir.IntType(8).as_pointer()
 
-def _place(context: Any, builder: Any, signature: Any, arguments: Any, indices: Any) -> Any:
-    """LLVM's pointer to the element of the first argument, an array, at ``indices``."""
-    kind = signature.args[0]
-    view = context.make_array(kind)(context, builder, arguments[0])
-    # wraparound: whether a negative index counts from the end, which costs a branch at each access.
-    return cast(Any, cgutils).get_item_pointer(context, builder, kind, view, list(indices), wraparound=False)
+
+def _opened(context: Any, builder: Any, kind: Any, *value: Any) -> Any:
+    """Fields of an array of this kind: of ``value``, or of a new one."""
+    return cast(Any, cgutils).create_struct_proxy(kind)(context, builder, *value)
+
+
+def _place(context: Any, builder: Any, kind: Any, array: Any, indices: Any) -> Any:
+    """LLVM's pointer to the element of ``array`` at ``indices``."""
+    whole = _opened(context, builder, kind, array)
+    lengths = [builder.extract_value(whole.shape, axis) for axis in range(kind.ndim)]
+    if kind.layout == "C":
+        number = indices[0]
+        for index, length in zip(indices[1:], lengths[1:], strict=True):
+            number = builder.add(builder.mul(number, length), index)
+        return builder.gep(whole.data, [number])
+    place = builder.bitcast(whole.data, _BYTE)
+    for axis, index in enumerate(indices):
+        place = builder.gep(place, [builder.mul(index, builder.extract_value(whole.strides, axis))])
+    return builder.bitcast(place, whole.data.type)
 
 
 def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """LLVM's code of ``unchecked_item`` and ``unchecked_at``."""
-    place = _place(context, builder, signature, arguments, arguments[1:])
-    return cast(Any, arrayobj).load_item(context, builder, signature.args[0], place)
+    kind, (array, *indices) = signature.args[0], arguments
+    return context.unpack_value(builder, kind.dtype, _place(context, builder, kind, array, indices))
 
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """LLVM's code of ``unchecked_slice`` and ``unchecked_table``."""
-    whole = context.make_array(signature.args[0])(context, builder, arguments[0])
-    place = _place(context, builder, signature, arguments, arguments[1:3])
-    view = context.make_array(signature.return_type)(context, builder)
-    size, shape = whole.itemsize, list(arguments[3:])
+    kind, (array, i, first, *shape) = signature.args[0], arguments
+    whole, view = _opened(context, builder, kind, array), _opened(context, builder, signature.return_type)
     # Strides of an array in C order, bytes.
-    steps = [*(builder.mul(columns, size) for columns in shape[1:]), size]
-    cast(Any, arrayobj).populate_array(view, place, shape, steps, size, whole.meminfo, whole.parent)
+    strides = [*(builder.mul(columns, whole.itemsize) for columns in shape[1:]), whole.itemsize]
+    view.data = _place(context, builder, kind, array, (i, first))
+    view.shape, view.strides = (cast(Any, cgutils).pack_array(builder, numbers) for numbers in (shape, strides))
+    view.nitems = shape[0] if len(shape) == 1 else builder.mul(*shape)
+    view.itemsize, view.meminfo, view.parent = whole.itemsize, whole.meminfo, whole.parent
     return view._getvalue()
 
 
 def _hint(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """LLVM's code of ``prefetch``."""
-    place = _place(context, builder, signature, arguments, arguments[1:])
-    number, byte = ir.IntType(32), ir.IntType(8).as_pointer()
-    hint = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-    function = cast(Any, cgutils).get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")
+    place = _place(context, builder, signature.args[0], arguments[0], arguments[1:])
+    number = ir.IntType(32)
+    hint = ir.FunctionType(ir.VoidType(), [_BYTE, number, number, number])
+    function = builder.module.declare_intrinsic("llvm.prefetch.p0", fnty=hint)
     # 1: it will be written; 3: keep it near; 1: data, not code
-    builder.call(function, [builder.bitcast(place, byte), number(1), number(3), number(1)])
+    builder.call(function, [builder.bitcast(place, _BYTE), number(1), number(3), number(1)])
     return context.get_dummy_value()
 
 

@@ -116,7 +116,7 @@ def test_types_are_told_by_the_names_of_their_fields() -> None:
     """Code finds a field by its place: two tuples that differ in their names alone are different types."""
     import numba
 
-    from bufgym.jit.cache import spelled_types
+    from bufgym.jit.folder import spelled_types
 
     whole = numba.types.int64
     tuples = [ModuleType(str(k)) for k in range(2)]
