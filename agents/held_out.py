@@ -25,26 +25,36 @@ from bufgym.policies import Policy, registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.scenario.numbered import draw
 from bufgym.sim.metrics import Outcome
+from bufgym.traces import Trace, synthetic_lte
+from bufgym.traces.shipped import SHIPPED_DURATION_S, SHIPPED_LTE
 
-HELD_OUT_TRACES = 2
+HELD_OUT_TRACES, GENERATED, FIRST_LINK = 2, 14, 30_000
+"""Shipped links that no training sees, links generated like them beside those, and the first seed of these."""
 FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
 """First seed of a split's episodes."""
 
 
+@functools.cache
+def generated() -> tuple[Trace, ...]:
+    """Links of the shipped ones' modes and means, by turns."""
+    kinds = [SHIPPED_LTE[k % len(SHIPPED_LTE)] for k in range(GENERATED)]
+    return tuple(synthetic_lte(FIRST_LINK + k, SHIPPED_DURATION_S, mean, mode) for k, (mode, mean) in enumerate(kinds))
+
+
 def split_scenario(on: Environment) -> tuple[Scenario, Scenario]:
-    """Training and held-out scenario, the same but for the traces; the last two traces are held out."""
+    """Training and held-out scenario, the same but for the traces: sixteen are held out, two of them shipped."""
     base = scenarios.get(gym.spec(on.env).kwargs["scenario"])
     if not isinstance(base, Uplink):
         return base, base
     base = replace(base, size_bytes=on.size_bytes, duration_s=on.duration_s)
     traces, held_out = base.traces[:-HELD_OUT_TRACES], base.traces[-HELD_OUT_TRACES:]
-    return replace(base, traces=traces), replace(base, traces=held_out)
+    return replace(base, traces=traces), replace(base, traces=(*held_out, *generated()))
 
 
 class FixedEpisodes:
     """Episodes that no training run sees, with the results of the clairvoyant and Drop Oldest.
 
-    ``validation`` has new episodes on the training traces, ``test`` has episodes on the held-out traces.
+    ``validation`` has new episodes on the training traces, ``test`` has episodes on the sixteen held-out traces.
     """
 
     def __init__(self, on: Environment, split: str, count: int) -> None:
@@ -73,7 +83,8 @@ class FixedEpisodes:
         rows = []
         for name, results in outcomes.items():
             for seed, (result, plan) in enumerate(zip(results, self._plans, strict=True)):
-                key = {"scenario": "", "trace": "", "seed": seed, "policy": name, "capacity": self.capacity}
+                link = self.episodes[seed].link.trace.name
+                key = {"scenario": "", "trace": link, "seed": seed, "policy": name, "capacity": self.capacity}
                 known = {"clairvoyant": plan.qoi, "certified": plan.certified}
                 lost = None if name in unbounded else regret(result.qoi, plan.qoi)
                 rows.append({**key, **asdict(result), **known, "regret": lost})
@@ -98,18 +109,21 @@ def known_mean(numbers: Sequence[float]) -> float:
 def summarise(outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str) -> list[dict[str, Any]]:
     """One entry per policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
 
-    ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals, paired as in ``score``:
-    policies meet the same episodes, so an episode's own QoI cancels.
+    ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals for fresh links, or for fresh
+    episodes of one link, paired as in ``score``: policies meet the same episodes, so an episode's own QoI cancels.
     """
     measured = {cell.policy: cell for cell in scores(rows).cells}
     reference = np.array([result.qoi for result in outcomes[agent]])
-    weights = times_drawn(len(reference), RESAMPLES, np.random.default_rng(SEED))
+    link = np.unique([row["trace"] for row in rows if row["policy"] == agent], return_inverse=True)[1]
+    drawn = link if link.max() > 0 else np.arange(len(link))
+    clusters = int(drawn.max()) + 1
+    weights = times_drawn(clusters, RESAMPLES, np.random.default_rng(SEED))[:, drawn]
     entries = []
     for name, results in outcomes.items():
         score, low, high = measured[name].score
         entry = {"policy": name, "score": score, "score_95": [low, high], "regret": measured[name].regret.value}
         entry |= {field.name: known_mean([getattr(o, field.name) for o in results]) for field in fields(Outcome)}
         less = np.array([result.qoi for result in results]) - reference
-        minus, low, high = interval(weights @ less / len(less), len(less))
+        minus, low, high = interval(weights @ less / weights.sum(axis=1), clusters)
         entries.append({**entry, "minus_agent": minus, "minus_agent_95": [low, high]})
     return sorted(entries, key=lambda entry: -entry["qoi"])

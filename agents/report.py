@@ -156,9 +156,9 @@ def report_environment(trained: Trained) -> Report:
     entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
     unranked = unranked_among(map(registry.get, registry.names()))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
-    over = f"these {len(traces)} links" if traces else "this kind"
+    over = "other links of this kind" if traces else "this kind"
     print(table(entries, best, alike, unranked))
-    print(f"in brackets: 95 % intervals for other episodes of {over}" + ", not for other links" * bool(traces))
+    print(f"in brackets: 95 % intervals for other episodes of {over}" + f", from {len(traces)} links" * bool(traces))
     print(verdict(entries, best, trained.best.seconds, trained.settings.algo, over))
     held_out = {"episodes": len(test.episodes), "traces": traces}
     notes = trained.save(trained.folder, held_out=held_out, scores=entries)

@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.held_out import FIRST_SEED, split_scenario
+from agents.held_out import FIRST_SEED, HELD_OUT_TRACES, split_scenario
 from agents.tasks import Environment
 from bufgym import policies
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
@@ -172,11 +172,12 @@ class Case(NamedTuple):
 
 
 def uplink_cases(capacities: Sequence[int], episodes: int) -> Iterator[Case]:
-    """The held-out episodes of ``train.py`` in ``bufgym/Uplink-v0``."""
+    """Episodes of ``bufgym/Uplink-v0`` on the two shipped links that ``train.py`` holds out."""
     for L in capacities or (8,):
         on = Environment(capacity=L)
         scenario = split_scenario(on)[True]
         assert isinstance(scenario, Uplink)
+        scenario = replace(scenario, traces=scenario.traces[:HELD_OUT_TRACES])
         for k in range(episodes or on.episodes):
             yield Case("", "", FIRST_SEED["test"] + k, scenario, L)
 

@@ -27,11 +27,12 @@ def reference(made, margins):
             return ACCEPT
         candidates, x = found(buffer, arrival, made.candidates)
         slots = [j for j, _ in candidates]
-        # What each action does. One whose candidate is not there does what the cheapest does.
-        does = [slots[0] if j is None else j for j in slots]
+        # What each action does. One whose candidate is not there does what the cheapest does; without any, no message goes.
+        cheapest = slots[0] if slots[0] is not None else ACCEPT if room else REJECT
+        does = [cheapest if j is None else j for j in slots]
         shown = [j is not None for j in slots]
         if made.at_arrivals:
-            does, shown = [ACCEPT if room else slots[0], *does], [True, shown[0] and room, *shown[1:]]
+            does, shown = [ACCEPT if room else cheapest, *does], [True, shown[0] and room, *shown[1:]]
         ranked = outputs(made, observed(buffer, arrival, candidates, x))
         ranked = sorted(((value, a) for a, value in enumerate(ranked) if shown[a] or not made.masks), reverse=True)
         others = [value for value, a in ranked if does[a] != does[ranked[0][1]]]
