@@ -109,8 +109,8 @@ def known_mean(numbers: Sequence[float]) -> float:
 def summarise(outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str) -> list[dict[str, Any]]:
     """One entry per policy, best QoI first: its score and regret, means over the episodes, QoI minus the agent's.
 
-    ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals for fresh links, or for fresh
-    episodes of one link, paired as in ``score``: policies meet the same episodes, so an episode's own QoI cancels.
+    ``rows`` belong to the outcomes. ``score_95`` and ``minus_agent_95`` are 95 % intervals for fresh links, or of one
+    link for fresh episodes, paired as in ``score``: policies meet the same episodes, so an episode's own QoI cancels.
     """
     measured = {cell.policy: cell for cell in scores(rows).cells}
     reference = np.array([result.qoi for result in outcomes[agent]])

@@ -27,7 +27,7 @@ def reference(made, margins):
             return ACCEPT
         candidates, x = found(buffer, arrival, made.candidates)
         slots = [j for j, _ in candidates]
-        # What each action does. One whose candidate is not there does what the cheapest does; without any, no message goes.
+        # What each action does. One whose candidate is not there does what the cheapest does; without any, none goes.
         cheapest = slots[0] if slots[0] is not None else ACCEPT if room else REJECT
         does = [cheapest if j is None else j for j in slots]
         shown = [j is not None for j in slots]
