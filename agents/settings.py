@@ -149,23 +149,6 @@ class ActorCritic(SingleDecisions):
 
 
 @dataclass(frozen=True)
-class GuidedPPO(ActorCritic):
-    """Train by PPO on the numbers of the rule gap-price, which evolve sets, in an environment."""
-
-    algo = "guided-ppo"
-    learner = "agents.guided_ppo:GuidedLearner"
-    validate_every: Natural = 65_536
-    """Steps; two updates, as it is best within half a million decisions. 0: a sixth of all."""
-    suites: Annotated[Suites, Parameter(parse=False)] = Suites()
-    n_steps: Count = 128
-    """Steps in each environment between updates."""
-    batch_size: Batch = 4096
-    """Decisions of one gradient step."""
-    epochs: Count = 4
-    """Passes over the decisions of an update."""
-
-
-@dataclass(frozen=True)
 class OnCandidates(SingleDecisions):
     """What algorithms share that choose among ordered candidates at a full buffer, by the library's own settings."""
 
@@ -301,5 +284,5 @@ class Hindsight(Settings):
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, GuidedPPO, Hindsight)
+ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""
