@@ -64,7 +64,8 @@ class Settings:
         if self.suites.suite and self.environment != type(self.environment)():
             raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
         if self.kind not in self.kinds:
-            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind ({self.kind})")
+            known = ", ".join(each.algo for each in ALGORITHMS if self.kind in each.kinds)
+            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind; these do: {known}")
 
     @property
     def on(self) -> Environment | Suites:
@@ -104,11 +105,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Evolve(Settings):
-    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue)."""
+    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule, for topics or a fleet (--suite)."""
 
     algo = "evolve"
     learner = "agents.cma_es:Evolution"
-    kinds = ("environment", "queue", "topics", "fleet")
+    kinds = ("topics", "fleet")
+    suites: Annotated[Suites, FLAT] = Suites(("topics-v1",))
     steps: Natural = 40_000_000
     """Decisions to learn from, for each seed."""
     cluster: Annotated[Cluster | None, FLAT] = None
