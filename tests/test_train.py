@@ -198,10 +198,10 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     assert {(row["policy"] == agent, row["training_seed"]) for row in rows} == {(True, 0), (False, None)}
     assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
     assert not any(row["invalid"] for row in rows if row["policy"] == agent)
-    # Validated before the first update, every 384 steps (hindsight: a step of all rows), and at the end; the best is kept.
+    # Validated before the first update, every 384 steps, and at the end; the best is kept.
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
-    # Validated before the first update, every 384 steps, and at the end; the best is kept.
+    validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
     assert (folder / runs.MODEL).read_bytes() == (home / runs.MODEL).read_bytes()
     if algo in LEARNERS:
         assert list(validation) == [0, 384, 768, 1152]

@@ -6,7 +6,6 @@ import functools
 import math
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.evaluation import ValidationSets, Verdict
