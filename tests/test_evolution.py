@@ -47,7 +47,7 @@ def test_one_run_through_the_longest_interruption_is_a_run_through_each(name: st
 
 REPO = Path(__file__).resolve().parent.parent
 LIBRARY = {"dask": "distributed", "ray": "ray"}
-FEW = {"suite": "fleet-v1", "capacities": "4", "validate_every": 19_000}
+FEW = {"suite": "fleet-v1", "capacities": "4", "validate_every": 230_000}
 FEW |= {"validation_episodes": 2, "test_seeds": 1, "seeds": 2}
 
 
@@ -69,7 +69,7 @@ def fitness(folder: Path, seed: int) -> list[tuple[str, str]]:
 def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(tmp_path_factory.mktemp("local"))
-        trained("local", 38_000)
+        trained("local", 460_000)
         return Path("runs/local").resolve()
 
 
@@ -81,8 +81,8 @@ def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pyte
     if importlib.util.find_spec(LIBRARY[backend]) is None:
         pytest.skip(needs("ray" if backend == "ray" else "extras", LIBRARY[backend]))
     local: Path = request.getfixturevalue("local")  # only where there is something to compare
-    trained("cluster", 19_000, "--backend", backend)
-    trained("cluster", 38_000, "--backend", backend, "--resume")
+    trained("cluster", 230_000, "--backend", backend)
+    trained("cluster", 460_000, "--backend", backend, "--resume")
     cluster = Path("runs/cluster")
     for seed in (0, 1):
         assert fitness(cluster, seed) == fitness(local, seed) and len(fitness(local, seed)) > 1
