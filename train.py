@@ -13,7 +13,7 @@ from typing import Annotated
 from cyclopts import App
 
 from agents.runs import prepare
-from agents.settings import ALGORITHMS, FLAT, PPO, Evolve, Hindsight, Settings
+from agents.settings import ALGORITHMS, FLAT, PPO, Hindsight, Settings
 from bufgym.cli.options import OPTIONS
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked
@@ -25,15 +25,15 @@ app = App(
     error_formatter=lambda said: f"error: {said}",
     suppress_keyboard_interrupt=False,
 )
-BEFORE = {"guided": "evolve", "maskable-ppo": "ppo", "ppo": "ppo", "dqn": "dqn", "guided-ppo": "guided-ppo"}
-"""A value that ``--algo`` had -> the command that now does it."""
+BEFORE = {"maskable-ppo": "ppo", "ppo": "ppo", "dqn": "dqn"}
+"""A value that ``--algo`` had -> the command that now does it; for others hindsight does."""
 
 
 @app.default
-def _three_ways(*, settings: Annotated[Evolve, FLAT] = Evolve()) -> None:  # noqa: B008
+def _two_ways(*, settings: Annotated[Hindsight, FLAT] = Hindsight()) -> None:  # noqa: B008
     """Train an agent on a bufgym environment, or on a whole suite, and evaluate it on held-out episodes.
 
-    Without a command: evolve. In an environment also hindsight and ppo, for about a minute each, to compare.
+    Without a command: hindsight. In an environment also ppo, for about a minute each, to compare.
     """
     main(settings, others_of(settings) if settings.kind == "environment" else ())
 
@@ -81,12 +81,9 @@ def _train(folder: Path, settings: Settings, others: Sequence[Settings]) -> None
 
 
 def others_of(settings: Settings) -> list[Settings]:
-    """The other ways to an agent, with the settings that evolution has too, each for at most a minute of one core."""
+    """The other way to an agent, with the settings that both have, for at most a minute of one core."""
     shared = {name: getattr(settings, name) for name in ("validation_episodes", "name", "resume", "seeds", "seed")}
-    return [
-        Hindsight(steps=min(settings.steps, 300_000), environment=settings.environment, **shared),
-        PPO(steps=min(settings.steps, 60_000), environment=settings.environment, **shared),
-    ]
+    return [PPO(steps=min(settings.steps, 60_000), environment=settings.environment, **shared)]
 
 
 def typed(words: Sequence[str]) -> None:
@@ -94,7 +91,7 @@ def typed(words: Sequence[str]) -> None:
     try:
         for k, word in enumerate(words):
             if word.startswith("--algo"):
-                now = BEFORE.get(word.partition("=")[2] or "".join(words[k + 1 : k + 2]), "evolve")
+                now = BEFORE.get(word.partition("=")[2] or "".join(words[k + 1 : k + 2]), "hindsight")
                 raise BufgymError(f"--algo is a command now: type python train.py {now}, then the other settings")
         app(words)
     except KeyboardInterrupt as stop:

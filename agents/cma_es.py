@@ -26,7 +26,7 @@ import numpy as np
 from agents.cluster import connected, running
 from agents.learner import Learner
 from agents.objectives import OBJECTIVES
-from agents.objectives.objective import Objective, Vector
+from agents.objectives.objective import Evolved, Vector
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Evolve
 from bufgym.policies import weights
@@ -43,7 +43,7 @@ Evaluate = Callable[[Sequence[GuidedWeights], int], list[tuple[float, int]]]
 """(candidates, part of the training episodes) -> (fitness, decisions) of each, in their order."""
 
 
-def evaluation_here(objective: Objective) -> Evaluate:
+def evaluation_here(objective: Evolved) -> Evaluate:
     """Evaluate candidates in this process, one after the other."""
 
     def evaluate(candidates: Sequence[GuidedWeights], part: int) -> list[tuple[float, int]]:
@@ -53,7 +53,7 @@ def evaluation_here(objective: Objective) -> Evaluate:
 
 
 @contextmanager
-def evaluation(settings: Evolve, folder: Path, seed: int, objective: Objective) -> Iterator[Evaluate]:
+def evaluation(settings: Evolve, folder: Path, seed: int, objective: Evolved) -> Iterator[Evaluate]:
     """Evaluate as the settings say: here, or on their cluster, with that seed's ``objective``."""
     if settings.cluster is None:
         yield evaluation_here(objective)
@@ -80,11 +80,18 @@ def evaluated_on_a_worker(
 
 
 @functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
-def _objective(settings: Evolve, folder: Path, seed: int) -> Objective:
-    return OBJECTIVES[settings.kind](settings, folder, seed)
+def _objective(settings: Evolve, folder: Path, seed: int) -> Evolved:
+    return objective_of(settings, folder, seed)
 
 
-def _evaluated(objective: Objective, candidate: GuidedWeights, part: int) -> tuple[float, int]:
+def objective_of(settings: Evolve, folder: Path, seed: int) -> Evolved:
+    """The task of a run for one seed."""
+    found = OBJECTIVES[settings.kind](settings, folder, seed)
+    assert isinstance(found, Evolved)
+    return found
+
+
+def _evaluated(objective: Evolved, candidate: GuidedWeights, part: int) -> tuple[float, int]:
     fitness = objective.fitness(candidate.policy(objective.name), part)
     return fitness, objective.decisions(part)
 
@@ -151,7 +158,7 @@ class Evolution(Learner[Evolve]):
         """
         settings, home = self.settings, folder / f"seed-{seed}"
         home.mkdir(exist_ok=True)
-        objective = self.objective(folder, seed)
+        objective = objective_of(settings, folder, seed)
         checkpoint = home / "evolution.pkl"  # only from your own run: pickles run code when they are read
         if checkpoint.exists():
             state: Search = pickle.loads(checkpoint.read_bytes())

@@ -71,7 +71,7 @@ class DecisionLearner(Learner[Decisions]):
         curve = Curve(home / "curve.csv", model.num_timesteps)
 
         def measure(model: Any) -> Numbers:
-            return objective.validate(self.weights_of(model).policy(objective.name))
+            return objective.validate(self.weights_of(model).policy(settings.algo))
 
         validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
         validation = Validation(home, validations, measure, objective.message, curve)

@@ -101,9 +101,3 @@ class Family:
         weights = times_drawn(links, RESAMPLES, np.random.default_rng(0))
         shares = [self.shares(self.play(policy), weights) for policy in several]
         return [(float(own[0]), [interval(own - other, links) for other in shares]) for own in shares]
-
-
-def divided(name: str, runs: Sequence[Run], n: int, parts: int, rng: np.random.Generator) -> list[Family]:
-    """So many families of n of the runs, in a random order that begins again at its end."""
-    order = rng.permutation(len(runs))
-    return [Family(name, [runs[order[(p * n + k) % len(runs)]] for k in range(n)]) for p in range(parts)]

@@ -175,7 +175,7 @@ class HindsightLearner(Learner[Hindsight]):
             ended = school.steps >= settings.steps or school.seconds >= self.seconds
             if validations.due(school.steps, last=ended):
                 agent = school.weights()
-                measures = objective.validate(agent.policy(objective.name))
+                measures = objective.validate(agent.policy(settings.algo))
                 if validations.add(school.steps, school.seconds, measures):
                     weights.save(home / MODEL, agent, self.notes(seed, settings.algo))
                 report = objective.message.format(*measures)

@@ -38,8 +38,8 @@ class Student(nn.Sequential):
                 for layer in first, second:
                     layer.weight[0], layer.bias[0] = 0.0, 0.0
                 first.bias[0] = -1.0
-                first.weight[0, names.index("guided_plain")] = 2.0
-                first.weight[0, names.index("guided_size_spread")] = 10.0
+                first.weight[0, names.index("rule_plain")] = 2.0
+                first.weight[0, names.index("rule_size_spread")] = 10.0
                 second.weight[0, 0] = 1.0
                 out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 

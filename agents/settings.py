@@ -64,7 +64,8 @@ class Settings:
         if self.suites.suite and self.environment != type(self.environment)():
             raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
         if self.kind not in self.kinds:
-            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind ({self.kind})")
+            known = ", ".join(each.algo for each in ALGORITHMS if self.kind in each.kinds)
+            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind; these do: {known}")
 
     @property
     def on(self) -> Environment | Suites:
@@ -104,11 +105,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Evolve(Settings):
-    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule (gap-price for one queue)."""
+    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule, for topics or a fleet (--suite)."""
 
     algo = "evolve"
     learner = "agents.cma_es:Evolution"
-    kinds = ("environment", "queue", "topics", "fleet")
+    kinds = ("topics", "fleet")
+    suites: Annotated[Suites, FLAT] = Suites(("topics-v1",))
     steps: Natural = 40_000_000
     """Decisions to learn from, for each seed."""
     cluster: Annotated[Cluster | None, FLAT] = None
@@ -146,23 +148,6 @@ class ActorCritic(SingleDecisions):
     gae_lambda: Share = 0.9
     entropy: Least0 = 0.0
     """Weight of the entropy bonus."""
-
-
-@dataclass(frozen=True)
-class GuidedPPO(ActorCritic):
-    """Train by PPO on the numbers of the rule gap-price, which evolve sets, in an environment."""
-
-    algo = "guided-ppo"
-    learner = "agents.guided_ppo:GuidedLearner"
-    validate_every: Natural = 65_536
-    """Steps; two updates, as it is best within half a million decisions. 0: a sixth of all."""
-    suites: Annotated[Suites, Parameter(parse=False)] = Suites()
-    n_steps: Count = 128
-    """Steps in each environment between updates."""
-    batch_size: Batch = 4096
-    """Decisions of one gradient step."""
-    epochs: Count = 4
-    """Passes over the decisions of an update."""
 
 
 @dataclass(frozen=True)
@@ -301,5 +286,5 @@ class Hindsight(Settings):
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, GuidedPPO, Hindsight)
+ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""

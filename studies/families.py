@@ -1,4 +1,4 @@
-"""Twelve families of links and streams for one agent: its training episodes, and others to choose it by."""
+"""Twelve families of links and streams, on which agents for all links are compared; no agent learns from these runs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agents.families import Run, merged, of_suite, run_of
-from agents.ready_families import FIRST_SEED, frames_over, random_stream
+from agents.ready_families import FIRST_SEED, TASK_EPISODES, frames_over, random_stream
 from bufgym.scenario.numbered import by_trace
 from bufgym.scenario.uplink import uplink_over_lte
 from bufgym.utils.files import replaced
@@ -18,10 +18,10 @@ UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
 
 
 def task(split: str) -> list[Run]:
-    """The task of ``make train``: its training links, at L = 8."""
+    """The training links of the task of ``make train``, at L = 8."""
     scenario = uplink_over_lte()
     parts = by_trace(replace(scenario, traces=scenario.traces[:-2]))
-    first = {"train": 1000, "validation": 1500, "test": 1800}[split]
+    first = TASK_EPISODES[split]
     return [run_of(trace, part, seed, 8) for trace, part in parts for seed in range(first, first + 8)]
 
 
@@ -39,9 +39,9 @@ def random_streams(split: str, count: int = 120) -> list[Run]:
 
 
 def families(split: str, folder: Path, data: str | None = None) -> dict[str, list[Run]]:
-    """All families by name; the bounds take minutes and are kept in ``folder``.
+    """All families of the split "validation" or "test"; the bounds take minutes and are kept in ``folder``.
 
-    With ``data``, a folder of recordings, there is one more that no agent learns from: recorded uplinks.
+    With ``data``, a folder of recordings, there is one more: recorded uplinks.
     """
     cameras: dict[str, list[Run]] = {}
 
@@ -55,8 +55,8 @@ def families(split: str, folder: Path, data: str | None = None) -> dict[str, lis
         "default-frames": lambda: default_frames(split),
         "lte": lambda: merged(of_suite("lte-v2", split, (5, 15))),
         "generated": lambda: merged(of_suite("generated-v2", split, (5, 15), every=2)),
-        "outage": lambda: merged(of_suite("outage-v1", split, (5, 15), seeds=1 if split == "train" else 4)),
-        "sustained": lambda: merged(of_suite("sustained-v1", split, (5, 15), seeds=1 if split == "train" else 4)),
+        "outage": lambda: merged(of_suite("outage-v1", split, (5, 15), seeds=4)),
+        "sustained": lambda: merged(of_suite("sustained-v1", split, (5, 15), seeds=4)),
         "interruption": lambda: merged(of_suite("interruption-v1", split, (5, 8, 16, 32), seeds=40)),
         "random": lambda: random_streams(split),
         "unequal-heavy": lambda: camera("heavy", False),

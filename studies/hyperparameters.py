@@ -1,6 +1,6 @@
 """What each algorithm of ``train.py`` reaches after some seconds: the table of docs/guide/hyperparameters.md.
 
-python -m studies.hyperparameters --env bufgym/Uplink-v0 --seconds 10 60 --algorithms evolve ppo
+python -m studies.hyperparameters --env bufgym/Uplink-v0 --seconds 10 60 --algorithms hindsight ppo
 
 Each run has as many steps as fit into its seconds, because the learning rate falls over the steps of a run: a pilot
 says how many. The score is that of the kept weights, which are the best on validation, on the held-out episodes.
@@ -14,21 +14,16 @@ import sys
 from pathlib import Path
 from typing import Any
 
-PILOTS = {
-    "evolve": ("evolve", 4_000_000),
-    "guided-ppo": ("guided-ppo", 200_000),
-    "ppo": ("ppo", 20_000),
-    "dqn": ("dqn", 20_000),
-}
-"""Algorithm -> its command, and the steps of its pilot."""
+PILOTS = {"hindsight": 40_000, "ppo": 20_000, "dqn": 20_000}
+"""Algorithm, a command of ``train.py`` -> the steps of its pilot."""
 ENVS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 
 
-def trained(env: str, words: str, steps: int) -> tuple[float, dict[str, Any]]:
+def trained(env: str, algorithm: str, steps: int) -> tuple[float, dict[str, Any]]:
     """The seconds that training took, and the results by policy, with the agent as ``agent``."""
     folder = Path("runs") / "hyperparameters"
     shutil.rmtree(folder, ignore_errors=True)
-    command = [sys.executable, "train.py", *words.split(), "--env", env, "--steps", str(steps), "--name", folder.name]
+    command = [sys.executable, "train.py", algorithm, "--env", env, "--steps", str(steps), "--name", folder.name]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(command)}: {done.stderr[-500:]}")
@@ -45,11 +40,11 @@ def main() -> None:
     options = parser.parse_args()
     print(f"{options.env}: score of the kept weights on held-out episodes; 0 is Drop Oldest, 1 the clairvoyant")
     for name in options.algorithms:
-        words, pilot = PILOTS[name]
-        took_s, _ = trained(options.env, words, pilot)
+        pilot = PILOTS[name]
+        took_s, _ = trained(options.env, name, pilot)
         rate = pilot / took_s
         for seconds in options.seconds:
-            took_s, scores = trained(options.env, words, round(rate * seconds))
+            took_s, scores = trained(options.env, name, round(rate * seconds))
             score, (low, high) = scores["agent"]["score"], scores["agent"]["score_95"]
             beside = ", ".join(f"{rule} {scores[rule]['score']:.3f}" for rule in ("afr", "target-gap", "gap-price"))
             print(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cma_es import Search, evaluation_here
-from agents.objectives.objective import Objective
+from agents.objectives.objective import Evolved
 from bufgym import policies
 from bufgym.benchmark.bootstrap import interval, stream, times_drawn
 from bufgym.policies import Policy
@@ -76,7 +76,7 @@ class Episodes:
         return [np.flatnonzero(row >= 0) for row in transmitted]
 
 
-class Task(Objective):
+class Task(Evolved):
     """The mean of a reward over episodes of the training links."""
 
     name = "on-task"

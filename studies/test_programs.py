@@ -18,7 +18,7 @@ SHORT = {
     "studies.relay_others": "--robots 2 --viewers 1 --seconds 1",
     "studies.relay_return": "--clients 2 --kills 1 --away 1",
     "studies.relay_soak": "--robots 3 --viewers 3 --minutes 0.05",
-    "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms evolve",
+    "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms hindsight",
 }
 """Program and verb -> the options that make it short."""
 NEEDED = {
@@ -33,7 +33,7 @@ ELSEWHERE = {
     "studies.coverage": "studies/test_coverage.py",
     "studies.fit": "studies/test_fit_page.py",
     "studies.fit_sizes": "studies/test_fit_sizes.py",
-    "studies.joint": "it trains for an hour",
+    "studies.learned": "tests/test_evolution.py",
     "studies.on_task": "studies/test_on_task.py",
     "studies.peers": "needs the other packages",
     "studies.perf": "studies/test_perf.py",

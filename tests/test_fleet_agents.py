@@ -100,7 +100,7 @@ def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch() -> None:
     rows = read_rows(folder / "rows.csv", TASK.layout)
     assert {row["capacity"] for row in rows if row["policy"] == "agent (seed 0)"} == {3, 4}
     agent, noted = weights.read(folder / "model.safetensors")
-    assert agent.widths == (8, 8) and noted["algo"] == "ppo"
+    assert agent.widths == (8, 8) and noted["algo"] == "fleet-ppo"
     table = folder / "seed-0" / "validation.csv"
     before = table.read_text().splitlines()
     train.main(dataclasses.replace(BY_PPO, resume=True, steps=512))

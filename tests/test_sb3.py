@@ -17,9 +17,8 @@ import torch
 from refusal_cases import refuse, refused
 from sb3_contrib import MaskablePPO, RecurrentPPO
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
-from stable_baselines3 import A2C, DQN, PPO, SAC
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common import env_util
-from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor, get_monitor_files
 
 import bufgym
@@ -308,15 +307,3 @@ def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
         (tmp_path / "none.zip", "no such file"),
     ):
         refuse(says, as_policy, model)
-
-
-@pytest.mark.parametrize("algorithm", [PPO, SAC])
-def test_guided_actions_are_those_of_any_continuous_agent(algorithm: Any) -> None:
-    options: dict[str, Any] = {"actions": "guided", "fields": "guided", **SMALL["bufgym/Uplink-v0"]}
-    check_env(gym.make("bufgym/Uplink-v0", **options).unwrapped)
-    settings = {"n_steps": 64} if algorithm is PPO else {"learning_starts": 200, "train_freq": 16}
-    envs = make_vec_env("bufgym/Uplink-v0", 8, seed=0, observation="flat", **options)
-    model = algorithm("MlpPolicy", envs, seed=0, device="cpu", **settings).learn(2_000)
-    action, _ = model.predict(envs.reset(), deterministic=True)
-    assert model.num_timesteps >= 2_000 and action.shape == (8, 10) and np.abs(action).max() <= 1
-    assert repr(reached(as_policy(model))) == repr(reached_in_env(model, "flat", "guided", "guided"))

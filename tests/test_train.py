@@ -16,7 +16,6 @@ from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.learner import learner_of
-from agents.objectives import environment
 from agents.report import verdict
 from agents.settings import (
     DQN,
@@ -25,7 +24,6 @@ from agents.settings import (
     Environment,
     Evolve,
     FleetPPO,
-    GuidedPPO,
     Hindsight,
     SingleDecisions,
     Suites,
@@ -42,19 +40,14 @@ UPDATE: dict[str, Any] = {"n_steps": 32, "epochs": 1}
 REPLAYED: dict[str, Any] = {"train_freq": 2, "gradient_steps": 1, "learning_starts": 64, "target_update_interval": 128}
 ON = Environment(capacity=3, duration_s=1.0, episodes=3)
 TINY = PPO(environment=ON, **SMALL, **UPDATE)
-LEARNERS = {
-    "ppo": TINY,
-    "dqn": DQN(environment=ON, **SMALL, **REPLAYED),
-    "guided-ppo": GuidedPPO(environment=ON, **SMALL, **UPDATE),
-}
+LEARNERS = {"ppo": TINY, "dqn": DQN(environment=ON, **SMALL, **REPLAYED)}
 ON_SUITE: dict[str, Any] = {"suites": Suites(("interruption-v1",), capacities=(4, 6), test_seeds=10), "name": "tiny"}
 ON_SUITE |= {"steps": 1_152, "validate_every": 384, "validation_episodes": 60}
 ROWS = {"num_envs": 12, "batch_size": 96}
 SUITE: dict[str, Any] = {
     name: dataclasses.replace(learner, **ON_SUITE, **ROWS, environment=type(learner.environment)())
     for name, learner in LEARNERS.items()
-    if name != "guided-ppo"
-} | {"evolve": Evolve(**ON_SUITE)}
+} | {"hindsight": Hindsight(**ON_SUITE, **ROWS)}
 """Three updates of 384 decisions: two rows of each of 3 scenarios x 2 capacities, 32 steps each."""
 
 
@@ -86,23 +79,19 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     assert "drop-oldest" in printed and "agent (seed 0)" in printed
 
 
-def test_an_agent_that_guides_a_rule_begins_as_that_rule(monkeypatch: Patch, capsys: Capsys) -> None:
-    monkeypatch.setattr(environment, "PARTS", 2)
-    monkeypatch.setattr(environment, "EPISODES", 2)
+def test_two_ways_are_compared_and_the_best_is_kept(capsys: Capsys) -> None:
+    """The network that the clairvoyant teaches begins as the rule that drops the cheapest."""
     on = Environment(capacity=8, duration_s=3.0, episodes=3)
-    evolve = Evolve(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
-    train.main(evolve, train.others_of(evolve))
+    taught = Hindsight(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
+    train.main(taught, train.others_of(taught))
     folder = Path("runs/tiny")
-    # One that the clairvoyant teaches begins as another.
-    (_, taught), *_ = columns(folder / "hindsight" / "seed-0" / "validation.csv", "steps", "qoi")
-    (_, first), *_ = columns(folder / "evolve" / "seed-0" / "validation.csv", "steps", "qoi")
+    (_, first), *_ = columns(folder / "hindsight" / "seed-0" / "validation.csv", "steps", "qoi")
     judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
-    for rule, reached in (("gap-price", first), ("min-motion-gap", taught)):
-        assert reached == np.mean([outcome.qoi for outcome in judges.play(policies.get(rule))])
+    assert first == np.mean([outcome.qoi for outcome in judges.play(policies.get("min-motion-gap"))])
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     scores = {row["policy"]: row["qoi"] for row in results["scores"]}
     best = results["settings"]["algo"]
-    for algo in ("evolve", "hindsight", "ppo"):
+    for algo in ("hindsight", "ppo"):
         name = "agent (seed 0)" if algo == best else f"agent by {algo} (seed 0)"
         agent = policies.load(folder / algo / "seed-0" / runs.MODEL)
         assert scores[name] == np.mean([outcome.qoi for outcome in test.play(agent)])
@@ -209,7 +198,7 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     assert {(row["policy"] == agent, row["training_seed"]) for row in rows} == {(True, 0), (False, None)}
     assert {row["scenario"] for row in rows} == set(suites.get("interruption-v1").settings("test"))
     assert not any(row["invalid"] for row in rows if row["policy"] == agent)
-    # Validated before the first update, every 384 steps (CMA-ES: a generation), and at the end; the best is kept.
+    # Validated before the first update, every 384 steps, and at the end; the best is kept.
     home = folder / "seed-0"
     merit = (home / "validation.csv").read_text(encoding="utf-8").splitlines()[0].split(",")[-1]
     validation = {int(steps): value for steps, value in columns(home / "validation.csv", "steps", merit)}
@@ -265,14 +254,15 @@ OR_ZERO = ("seed", "steps", "validate-every", "validation-episodes", "gamma", "g
         ("--capacities 5", "are of a suite, which --suite names"),
         ("--env bufgym/Interruption-v0 --size-bytes 5", "its messages have no size"),
         ("dqn --suite fleet-v1", "suite fleet-v1: dqn learns none of this kind"),
-        ("guided-ppo --suite lte-v1", "Unknown option: --suite"),
+        ("evolve --suite lte-v1", "suite lte-v1: evolve learns none of this kind; these do: ppo, dqn, hindsight"),
+        ("--suite topics-v1", "suite topics-v1: hindsight learns none of this kind; these do: evolve"),
         ("fleet-ppo --width 1000", "width = 1000: a file of weights has at most 256 hidden units a layer"),
         ("fleet-ppo --suite lte-v1", "suite lte-v1: fleet-ppo learns none of this kind"),
         ("ppo --backend dask", "Unknown option: --backend"),
-        ("--backend no", '"no" for --backend. Choose from'),
-        ("--address host:1", "--backend requires"),
+        ("evolve --backend no", '"no" for --backend. Choose from'),
+        ("evolve --address host:1", "--backend requires"),
         ("--resume --name none", "there is no run in"),
-        ("--algo guided --num-envs 8", "type python train.py evolve, then"),
+        ("--algo guided --num-envs 8", "type python train.py hindsight, then"),
         ("--suite lte-v1 --algo=maskable-ppo", "type python train.py ppo, then"),
     ],
 )
@@ -295,13 +285,13 @@ def test_the_command_of_a_run_gives_its_settings_again() -> None:
         assert made == [dataclasses.replace(expected, cluster=None) if isinstance(expected, Evolve) else expected]
 
 
-def test_without_words_three_ways_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_words_two_ways_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """``python train.py``, the command of ``make train``."""
     asked: list[Any] = []
     monkeypatch.setattr(train, "main", lambda settings, others=(): asked.append((settings, others)))
     with pytest.raises(SystemExit):
         train.typed([])
-    assert asked == [(Evolve(), [Hindsight(steps=300_000), PPO(steps=60_000)])]
+    assert asked == [(Hindsight(), [PPO(steps=60_000)])]
 
 
 def test_the_verdict_says_how_far_above_whom() -> None:
@@ -313,8 +303,8 @@ def test_the_verdict_says_how_far_above_whom() -> None:
         *(entry("agent by ppo (seed 1)", 0.6, -2.0, -1.0), entry("agent by ppo (seed 0)", 0.5, -3.0, -1.0)),
         entry("afr", 0.4, -5.0, -4.0),
     ]
-    assert verdict(entries, "a", 61.4, "evolve", "other links") == (
-        "after 61 s a, by evolve, scores 0.700 on episodes of other links: above AFR by 0.300, "
+    assert verdict(entries, "a", 61.4, "hindsight", "other links") == (
+        "after 61 s a, by hindsight, scores 0.700 on episodes of other links: above AFR by 0.300, "
         "level with the best rule written by hand, min-gap, (+0.010), "
         "below learned by 0.050, above agent by ppo (seed 1) by 0.100"
     )

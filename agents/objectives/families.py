@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from agents.families import Family
 from agents.objectives.objective import Objective
@@ -31,7 +30,6 @@ def _families(names: tuple[str, ...], split: str, runs: int) -> list[Family]:
 class FamiliesObjective(Objective):
     """The families of a run."""
 
-    name = "hindsight"
     best = min
 
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
@@ -46,11 +44,7 @@ class FamiliesObjective(Objective):
         """The validation runs of each family."""
         return _families(self.names, "validation", -(-self.settings.validations() // len(self.names)))
 
-    def measure(self, policy: Policy, episodes: list[Family]) -> float:
-        """Share of AFR's regret, mean over the families."""
-        return sum(family.share(policy) for family in episodes) / len(episodes)
-
-    def validate(self, agent: Any) -> tuple[float, ...]:
+    def validate(self, agent: Policy) -> tuple[float, ...]:
         """The share of AFR's regret on each family, and their mean."""
         shares = [family.share(agent) for family in self.judges]
         return (*shares, sum(shares) / len(shares))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.objectives.objective import Objective
+from agents.objectives.objective import Evolved
 from agents.settings import Settings
 from agents.tasks import Suites
 from bufgym import policies
@@ -94,7 +94,7 @@ def validation_episodes(settings: Settings) -> list[FleetEpisodes]:
     return [FleetEpisodes(drawn[0][0], episodes, L) for L in capacities]
 
 
-class FleetObjective(Objective):
+class FleetObjective(Evolved):
     """The robots of one suite."""
 
     name = "fleet"

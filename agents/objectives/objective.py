@@ -1,4 +1,4 @@
-"""The task of a run: what is trained on, what validation measures, what the report compares."""
+"""The measures and episodes by which a run's agent is trained, validated and reported."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ Vector = NDArray[np.float64]
 
 
 class Objective(ABC):
-    """One kind of task: the start of a search, the comparison of candidates, the choice of the agent to keep.
-
-    Training episodes come in parts, one a generation in turn, so that many episodes cost no more than a few.
+    """One kind of task: the environments to learn in, the choice of the agent to keep, its report.
 
     Args:
         settings: the run's settings.
@@ -30,18 +28,12 @@ class Objective(ABC):
         seed: the training seed, which training episodes are drawn from.
     """
 
-    name: str
-    """Name of its policies."""
     columns: tuple[str, ...]
     """Names of the measures of ``validate``; the last one chooses the agent to keep."""
     best: Callable[..., Any]
     """``min`` or ``max``, the better direction of that last measure."""
     message: str
     """Format of the measures in words."""
-    sigma = 0.02
-    """First step size; 0.1 diverges."""
-    training: Any
-    """Training episodes by part; each set has ``decisions``, the approximate number per candidate."""
     judges: Any
     """The validation episodes."""
 
@@ -51,6 +43,36 @@ class Objective(ABC):
     def prepare(self) -> None:
         """Do once for all seeds what each would do for itself."""
         return
+
+    @abstractmethod
+    def validate(self, agent: Policy) -> tuple[float, ...]:
+        """The measures of an agent on the validation episodes."""
+
+    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
+        """Environments to learn from single decisions in; ``options`` are those of the learner's actions."""
+        raise NotImplementedError
+
+    def lines_to_beat(self) -> dict[str, float]:
+        """The validation scores to beat, of fixed policies by name; they are printed as well."""
+        return {}
+
+    @abstractmethod
+    def report(self, trained: Trained) -> Report:
+        """Compare the agents of all seeds with the fixed policies."""
+
+
+class Evolved(Objective):
+    """A task whose agent may be evolved: one measure compares candidates and validates.
+
+    Training episodes come in parts, one a generation in turn, so that many episodes cost no more than a few.
+    """
+
+    name: str
+    """Name of its candidates."""
+    sigma = 0.02
+    """First step size; 0.1 diverges."""
+    training: Any
+    """Training episodes by part; each set has ``decisions``, the approximate number per candidate."""
 
     def start(self) -> GuidedWeights:
         """The weights at which the search begins: zeros, the plain rule."""
@@ -69,22 +91,14 @@ class Objective(ABC):
         """Decisions of one candidate on a part."""
         return sum(episodes.decisions for episodes in self.training[part % len(self.training)])
 
-    def validate(self, agent: Any) -> tuple[float, ...]:
-        """The measures of an agent on the validation episodes; it is a policy where no model plays."""
+    def validate(self, agent: Policy) -> tuple[float, ...]:
+        """The measure on the validation episodes."""
         return (self.measure(agent, self.judges),)
-
-    def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
-        """Environments to learn from single decisions in; ``options`` are those of the learner's actions."""
-        raise NotImplementedError
-
-    def lines_to_beat(self) -> dict[str, float]:
-        """The validation scores to beat, of fixed policies by name; they are printed as well."""
-        return {}
 
     def rivals(self) -> list[Policy]:
         """The fixed policies that agents are compared with on the test split."""
         raise NotImplementedError
 
     def report(self, trained: Trained) -> Report:
-        """Compare the agents of all seeds with the fixed policies."""
+        """A row of the benchmark for each agent and fixed policy in each episode of the test split."""
         return report_rows(trained, self.rivals())

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.objectives.objective import Objective
+from agents.objectives.objective import Evolved
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark import tasks
@@ -142,7 +142,7 @@ def varied(client: Client, rng: np.random.Generator) -> Client:
     return replace(client, streams=streams, scale=float(np.exp(rng.uniform(*np.log(SCALES)))))
 
 
-class TopicsObjective(Objective):
+class TopicsObjective(Evolved):
     """The clients of one suite."""
 
     name = "evolved"

@@ -52,7 +52,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
     - ``capacity``: L of every robot, messages.
     - ``max_bytes``: B, bytes.
     - ``reward``: "team" or "own".
-    - ``term``: as ``reward`` in ``SenderEnv``, and so are its other options, but for ``bound`` and what is guided.
+    - ``term``: as ``reward`` in ``SenderEnv``, and so are its other options, but for ``bound``.
     - any further argument replaces a parameter of the uplink.
 
     ``reset(options={"episode": e})`` plays the ``FleetEpisode`` e; other options are ignored, as in PettingZoo.

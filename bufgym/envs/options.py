@@ -18,9 +18,8 @@ from bufgym.utils.errors import BufgymError, UnknownArgumentError, unknown
 if TYPE_CHECKING:
     from bufgym.envs.render import Window
 
-GUIDED = "guided"
 CANDIDATES, SLOTS = "candidates", "slots"
-ACTIONS = (CANDIDATES, SLOTS, GUIDED)  # What an action is: the candidate or slot that goes, or numbers of the rule
+ACTIONS = (CANDIDATES, SLOTS)  # What an action is: the candidate or the slot that goes
 INFOS = ("full", "summary", "mask", "none")
 """How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
 nothing. At an episode's end the summary is always there."""
@@ -72,18 +71,15 @@ class Options:
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
         whole("candidates", self.candidates, 1, MOST_CANDIDATES)
-        if self.acts_on_candidates and self.fields in ("compact", GUIDED):
-            given = f"fields = {self.fields!r}"
-            raise BufgymError(f"{given}: is for actions = 'slots'; {CANDIDATES!r} have fields of their own")
-        names: Any = () if self.fields in (None, "compact", GUIDED) else self.fields
+        if self.acts_on_candidates and self.fields == "compact":
+            raise BufgymError(f"fields = 'compact': is for actions = 'slots'; {CANDIDATES!r} have fields of their own")
+        names: Any = () if self.fields in (None, "compact") else self.fields
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
-            raise BufgymError(f"fields = {names!r}: must be a list of names, 'compact' or 'guided'")
+            raise BufgymError(f"fields = {names!r}: must be a list of names or 'compact'")
         if not isinstance(self.bound, bool | np.bool_):
             raise BufgymError(f"bound = {self.bound!r}: must be True or False")
         whole("num_threads", self.num_threads, 1)
-        if self.mask_keys and self.acts_guided:
-            raise BufgymError(f"mask_in_observation: actions = {GUIDED!r} have no mask")
 
     def window(self) -> "Window | None":
         """A window that shows each step, for the ``render_mode`` "human"."""
@@ -100,23 +96,13 @@ class Options:
 
     @property
     def asked_at(self) -> str:
-        """When it is asked: ``decide_at``, by default "overflow" for candidates and "arrival" for others."""
+        """When it is asked: ``decide_at``, by default "overflow" for candidates and "arrival" for slots."""
         return self.decide_at or ("overflow" if self.acts_on_candidates else "arrival")
 
     @property
     def form(self) -> str:
-        """Form of an observation: ``observation``, by default "flat" for candidates and "dict" for others."""
+        """Form of an observation: ``observation``, by default "flat" for candidates and "dict" for slots."""
         return self.observation or ("flat" if self.acts_on_candidates else "dict")
-
-    @property
-    def acts_guided(self) -> bool:
-        """Whether an action sets the numbers of a rule."""
-        return self.actions == GUIDED
-
-    @property
-    def sees_guided(self) -> bool:
-        """Whether an observation holds that rule's inputs, and nothing else."""
-        return self.fields == GUIDED
 
     @property
     def shows_all(self) -> bool:
@@ -126,7 +112,7 @@ class Options:
     @property
     def shows_mask(self) -> bool:
         """Whether ``info`` has the action mask in every step."""
-        return self.info != "none" and not self.acts_guided
+        return self.info != "none"
 
     @property
     def mask_keys(self) -> MaskKeys | None:
@@ -160,9 +146,6 @@ class Options:
             )
         if self.acts_on_candidates:
             raise BufgymError(f"actions = {CANDIDATES!r}: known for one queue on a link of its own, not for {what}")
-        if self.acts_guided or self.sees_guided:
-            given = f"{'actions' if self.acts_guided else 'fields'} = {GUIDED!r}"
-            raise BufgymError(f"{given}: the rule serves one queue on a link of its own, not {what}")
 
 
 _NAMES = tuple(field.name for field in fields(Options))

@@ -123,27 +123,20 @@ def write_progress(batch: Batch, i: int, ended: bool, output: StepOutput) -> Non
 
 
 @kernel
-def write_state(batch: Batch, i: int, ended: bool, output: StepOutput) -> bool:
-    """Write whether row ``i`` has ended, its H and action mask; return whether a decision is due.
+def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput, chosen: Chosen | None) -> None:
+    """Write whether row ``i`` has ended, its H, its action mask and the fields of its tables.
 
-    Without one, also write an observation of zeros, with L as the one valid action.
+    With one queue the fields only if none are ``chosen``. Without a decision due, the observation is zeros, and L is
+    the one valid action.
     """
     write_progress(batch, i, ended, output)
-    if batch.senders[i].waiting == NOTHING_WAITS:
+    sender = batch.senders[i]
+    if sender.waiting == NOTHING_WAITS:
         output.flat[i, :] = 0.0
         output.action_mask[i, :] = False
-        output.action_mask[i, batch.senders[i].capacity] = True
-        return False
-    write_mask(batch, i, output.action_mask)
-    return True
-
-
-@kernel
-def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput, chosen: Chosen | None) -> None:
-    """Write row ``i``'s state and the observation of its tables' fields; with one queue only if none are ``chosen``."""
-    if not write_state(batch, i, ended, output):
+        output.action_mask[i, sender.capacity] = True
         return
-    sender = batch.senders[i]
+    write_mask(batch, i, output.action_mask)
     buffer, entries = view(batch, i), sender.capacity + 1
     if batch.several is not None:
         entries *= output.slots[0]

@@ -90,17 +90,14 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``scenario``: a name in ``bufgym.scenario.SCENARIOS``, ``module:function`` that makes one, or a scenario.
     - ``capacity``: L, messages.
     - ``max_bytes``: B, bytes, by default without limit.
-    - ``actions``: "candidates", the default of one queue; "slots", the only one of several topics; or "guided" (one
-      queue): ``Box(-1, 1, (10,))`` sets the numbers of the rule gap-price for this decision, by the table
-      ``bufgym.policies.guided.OUTPUTS``. Zeros are the rule itself. There is no mask, and no invalid action.
+    - ``actions``: "candidates", the default of one queue; or "slots", the only one of several topics.
     - ``candidates``: how many of the cheapest candidates are actions beside the head, 1 to 64.
     - ``decide_at``: "overflow" asks only when the buffer is full, "arrival" at every arrival. Candidates are asked at
-      overflow by default, slots and guided actions at arrivals.
-    - ``observation``: "flat", the default of candidates; "dict", the default of slots and guided actions; or "slots".
+      overflow by default, slots at arrivals.
+    - ``observation``: "flat", the default of candidates; "dict", the default of slots; or "slots".
     - ``fields``: with candidates, names of fields to observe beside the 27 numbers, your own or those of
       ``ON_BOARD_FIELDS``. With slots, names of the fields to observe, by default all of the tables; "compact" means all
-      of the context's. With slots and guided actions, "guided" means ``bufgym.policies.guided.INPUTS``, which lie in
-      [-4, 4].
+      of the context's.
     - ``reward``: a term's name, or weights by name; ``regret`` and terms of your own take part only if named.
     - ``reward_scale``: factor on the reward, by default none. "episode" is the constant ``reward_scale`` of the
       scenario's class, which brings a rule's return in a default episode between 1 and 10; weights of your own terms

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
-from bufgym.envs.guided import Guide, guided_decision, write_guided
 from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
 from bufgym.jit import kernel, prefetch, without_dispatch
 from bufgym.model.buffer import HOLD
@@ -42,15 +41,14 @@ def step_rows(
     rewarded: NDArray[np.float64],
     output: StepOutput,
     choices: Choices | None,
-    guide: Guide | None,
     chosen: Chosen | None,
 ) -> None:
     """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
     begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is
-    None where actions are no candidates, ``guide`` where nothing is guided, ``chosen`` where no built-in fields are
-    named. Numba compiles each case separately.
+    None where actions are no candidates, ``chosen`` where no built-in fields are named. Numba compiles each case
+    separately.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -65,10 +63,8 @@ def step_rows(
         if not begins and asks == ARRIVAL_WAITS:
             if choices is not None:
                 decide(batch, i, candidate_decision(batch, i, actions[i], choices))
-            elif guide is None:
-                decide(batch, i, decision_of(actions[i], sender.capacity))
             else:
-                decide(batch, i, guided_decision(batch, i, actions[i], guide))
+                decide(batch, i, decision_of(actions[i], sender.capacity))
         if batch.several is not None and not begins and asks == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
@@ -76,10 +72,8 @@ def step_rows(
         write_rewards(batch, i, begins, rewarded, output)
         if choices is not None:
             write_candidates(batch, i, sender.waiting == NOTHING_WAITS, output, choices)
-        elif guide is None:
-            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output, chosen)
         else:
-            write_guided(batch, i, sender.waiting == NOTHING_WAITS, output, guide, chosen)
+            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output, chosen)
         if chosen is not None:
             write_named(batch, i, chosen, output.flat)
 

@@ -14,7 +14,6 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym.envs.candidates import new_choices
-from bufgym.envs.guided import Guiding
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
 from bufgym.envs.output import StepOutput
@@ -34,7 +33,6 @@ from bufgym.model.observe import (
     terms_for,
 )
 from bufgym.oracle.measure import MEASURED, measured
-from bufgym.policies.guided import INPUT_FIELDS
 from bufgym.scenario import Scenario, Streams
 from bufgym.scenario.numbered import Pool, numbered
 from bufgym.sim import Senders
@@ -88,15 +86,12 @@ class SubEnvs:
             self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
 
-        self.guiding = Guiding(n, options) if options.acts_guided or options.sees_guided else None
-        self._guide = self.guiding and self.guiding.guide
-        self._acts = self.guiding if options.acts_guided else None
         self.choices = None
         self.actions_count = self.capacity + 2
         if options.acts_on_candidates:
             self.choices = new_choices(n, options.candidates, options.asked_at == "arrival")
             self.actions_count = options.candidates + 1 + (options.asked_at == "arrival")
-        self.action_space: Any = self._acts.action_space if self._acts else spaces.Discrete(self.actions_count)
+        self.action_space = spaces.Discrete(self.actions_count)
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
         self.terms = terms_for(several_topics) + own_terms
@@ -121,8 +116,6 @@ class SubEnvs:
         With several topics it leaves out the slot fields if none of them is observed.
         """
         options, several_topics = self.options, bool(self.scenario.topics)
-        if options.sees_guided:
-            return ObservationForm(options.form, (), INPUT_FIELDS, self.capacity, mask=options.mask_keys)
         if self.choices is not None:
             return ObservationForm(
                 options.form, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
@@ -176,8 +169,6 @@ class SubEnvs:
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
-        if self.guiding:
-            self.guiding.begin(rows)
         self._run(self._load(rows, episodes), NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
@@ -222,8 +213,7 @@ class SubEnvs:
         return rows
 
     def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        how = self.choices, self._guide, self.form.named
-        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, *how)
+        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
@@ -272,8 +262,6 @@ class SubEnvs:
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
-        if self._acts:
-            return int(self._acts.take(name, action)[0])
         try:
             number = operator.index(action)
         except TypeError:
@@ -300,8 +288,6 @@ class SubEnvs:
 
     def actions(self, actions: Any) -> NDArray[np.int64]:
         """Convert one action for each sub-environment to the kernels' form; the error names the first that is wrong."""
-        if self._acts:
-            return self._acts.take("actions", actions)
         numbers = np.asarray(actions)
         if numbers.dtype.kind not in "iu":
             raise InvalidActionError(f"actions are {numbers.dtype}: must be whole numbers (int64)")

@@ -20,14 +20,14 @@ def entry_point_of(compiled: Any) -> Any:
 def without_dispatch(compiled: Any) -> Any:
     """A ``kernel`` over a batch that Python calls for every step, without a look at the types of its arguments.
 
-    It has three arguments or more. Calls with equal ``batch.several``, and None as the same of the last three
-    arguments, have arguments of equal types.
+    It has two arguments or more. Calls with equal ``batch.several``, and None as the same of the last two arguments,
+    have arguments of equal types.
     """
-    entries: dict[tuple[bool | None, bool, bool, bool], Any] = {}
+    entries: dict[tuple[bool | None, bool, bool], Any] = {}
 
     @functools.wraps(compiled.py_func)
     def call(*arguments: Any) -> Any:
-        kind = arguments[0].several, arguments[-1] is None, arguments[-2] is None, arguments[-3] is None
+        kind = arguments[0].several, arguments[-1] is None, arguments[-2] is None
         if kind not in entries:
             entries[kind] = compiled.compile(tuple(map(cast(Any, numba).typeof, arguments)))
         return entries[kind](*arguments)

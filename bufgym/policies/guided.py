@@ -1,8 +1,8 @@
 """Guided decisions: a few *outputs* change the numbers of one rule, ``gap-price``, for the decision at hand.
 
-The outputs are factors and shifts on the rule's numbers, and come from outside: from an agent, or from an action of an
-environment. All outputs zero are the rule itself. So an agent begins at the rule and learns what to add to it, as
-residual policy learning does [silver2018residual; johannink2019residual]. ``OUTPUTS`` are their meanings.
+The outputs are factors and shifts on the rule's numbers, and come from an agent. All outputs zero are the rule itself.
+So an agent begins at the rule and learns what to add to it, as residual policy learning does [silver2018residual;
+johannink2019residual]. ``OUTPUTS`` are their meanings.
 
 ``INPUTS`` are what an agent may look at to find its outputs: what the rule knows, as logarithms of ratios. With
 
@@ -46,7 +46,7 @@ class Output(NamedTuple):
 
     name: str
     scale: float
-    """The output for an action of 1."""
+    """Size of a large change. Files are checked by it, and nothing else reads it."""
     meaning: str
 
 
@@ -64,7 +64,6 @@ OUTPUTS = (
 )
 O_THRESHOLD, O_DISCOUNT, O_HEAD, O_BIAS, O_NEAR, O_KAPPA, O_TAIL = range(7)
 O_PRICE_THRESHOLD, O_PRICE_DISCOUNT, O_SHARE = range(7, 10)
-SCALES = np.array([output.scale for output in OUTPUTS])
 
 MOST = 3.0  # Largest input and output, either way
 SPREAD_US = 10e6  # Time over which the spread of the link's rate is measured, us

@@ -46,7 +46,7 @@ from bufgym.policies.thinning import steady
 
 NOT_OFFERED = -100
 """In place of the decision of an action that is not offered."""
-OF_RULE = tuple(f"guided_{field.name}" for field in INPUT_FIELDS)
+OF_RULE = tuple(f"rule_{field.name}" for field in INPUT_FIELDS)
 EVEN_US, EVEN = 3e6, 2.5e-5
 """How long a link must have been measured, us, and the variance of its log rate below which it has not varied."""
 STATE = ("room", "log_capacity")

@@ -15,7 +15,6 @@ from bufgym.envs.own import write_in_python
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
 from bufgym.policies import Policy, candidate_network
-from bufgym.policies.guided import BASE, N_INPUTS, N_OUTPUTS, REMEMBERED, SCALES, WORK, follow, inputs, recall
 from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
@@ -29,8 +28,8 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
 
     Two kinds of networks run compiled and serve every L: "MlpPolicy" of PPO, A2C, MaskablePPO and DQN that observes
     candidates, "flat", and a network that scores slots with masks (``SlotPolicy`` under MaskablePPO). Any other network
-    runs in torch, one decision at a time. It serves every L if it observes candidates or is guided, and otherwise the L
-    it was trained for. Algorithms that take action masks get them. For others, an invalid action does the same as in
+    runs in torch, one decision at a time. It serves every L if it observes candidates, and otherwise the L it was
+    trained for. Algorithms that take action masks get them. For others, an invalid action does the same as in
     the environment. An observation "flat" or "slots" must be of every field; a "dict" names its fields.
 
         policy = as_policy("model.zip", "mine")
@@ -52,9 +51,6 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
         raise BufgymError(f"model {name}: has a recurrent network, whose state a policy cannot keep")
     refuse_normalized(agent)
     about = f"A trained {type(agent).__name__}."
-    guided = spaces.Box(-1.0, 1.0, (N_OUTPUTS,), np.float32)
-    if agent.action_space == guided and agent.observation_space.shape == (N_INPUTS,):
-        return _guided(name, agent, about)
     masked = takes_masks(agent) and getattr(network, "masked", True)
     candidates = candidates_of(agent)
     if candidates is not None:
@@ -72,18 +68,6 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     return Policy(name, decisions.on_arrival, on_send=decisions.on_send, about=about, reads_rate=True, for_topics=True)
 
 
-def _guided(name: str, agent: Any, about: str) -> Policy:
-    """Make the policy of a model whose actions set the numbers of gap-price."""
-
-    def on_arrival(buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:
-        seen = np.zeros(N_INPUTS, np.float32)
-        recall(buffer, arrival, memory, BASE)
-        inputs(buffer, arrival, memory, BASE, seen)
-        return follow(buffer, arrival, memory, BASE, agent.predict(seen, deterministic=True)[0] * SCALES)
-
-    return Policy(name, on_arrival, memory=REMEMBERED, work=WORK, about=about, reads_rate=True)
-
-
 class _Decisions:
     """Decisions of a model from a robot's view, one at a time."""
 
@@ -92,7 +76,7 @@ class _Decisions:
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
-            rule = "must be Discrete(L + 2), or that of candidates, or guided and seen flat"
+            rule = "must be Discrete(L + 2), or that of candidates"
             raise BufgymError(f"model {name}: action space {actions}: {rule}")
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
         if form == "dict" and {"slots", "context"} & set(space):

@@ -19,7 +19,6 @@ from bufgym.benchmark.rows import read_rows
 from bufgym.benchmark.run import run
 from bufgym.policies import REJECT
 from bufgym.scenario import FleetScenario
-from bufgym.utils import files
 
 MODULE = """
 from bufgym.policies import ACCEPT, REJECT, Policy, register
@@ -203,11 +202,10 @@ def test_a_policy_made_here_says_itself_that_it_does_not_compete() -> None:
 def test_a_suite_takes_files_and_named_policies_and_those_registered_here(tmp_path: Path, monkeypatch: Patch) -> None:
     """A suite's processes load a file themselves; a policy registered in this process runs in this process."""
     monkeypatch.chdir(tmp_path)
-    shipped = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
-    shutil.copy(shipped["learned-ppo"], "mine.safetensors")
+    shutil.copy(SHIPPED, "mine.safetensors")
     options: dict[str, Any] = {"capacity": 2, "seeds": 1, "progress": False}
-    done = bufgym.compare([Path("mine.safetensors"), "learned-ppo"], "interruption-v1", **options)
-    assert {row["policy"] for row in done.rows} == {"mine", "learned-ppo", "drop-oldest", "afr"}
+    done = bufgym.compare([Path("mine.safetensors"), "learned"], "interruption-v1", **options)
+    assert {row["policy"] for row in done.rows} == {"mine", "learned", "drop-oldest", "afr"}
     policies.register("stubborn")(stubborn)
     done = bufgym.compare(stubborn, "interruption-v1", **options)
     assert {row["policy"] for row in done.rows} == {"stubborn", "drop-oldest", "afr"}

@@ -165,6 +165,8 @@ def test_shipped_agents_are_read_when_they_are_asked_for(path):
         refuse("a built-in policy has this name", policies.register, name)
     registry.register_later("afr", lambda: small)
     assert policies.get("afr").name == "afr"
+    registry.register_later("sent", lambda: replace(small, name="sent"), named_only=True)
+    assert "sent" not in policies.names() and policies.get("sent").named_only
 
 
 def test_fields_beside_the_tables_are_read_by_name(path):

@@ -241,7 +241,7 @@ test_wrong_use_is_named = refused(
         (lambda k=k: SenderEnv(mask_in_observation=("mask", k), actions="slots"), "two names of keys or")
         for k in ("mask", 1)
     ),
-    (lambda: SenderEnv(mask_in_observation=True, actions="guided"), "actions = 'guided' have no mask"),
+    (lambda: SenderEnv(actions="guided"), "unknown actions 'guided'; known: candidates, slots"),
     (lambda: SenderEnv(mask_dtype="float32", actions="slots"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
     *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}", INVALID) for a in (1.7, np.array([1]), "1", None)),
     (lambda: begun().step(6), r"action = 6: must be a whole number in 0\.\.5", INVALID),

@@ -91,9 +91,6 @@ FORMS: list[dict[str, Any]] = [
 ]
 
 
-GUIDED = [("fading", "guided"), ("fading", None), ("dying", "guided"), ("interruption", "guided")]
-
-
 @pytest.mark.parametrize("mode", [NEXT_STEP, SAME_STEP])
 @pytest.mark.parametrize(
     ("case", "limit", "options"),
@@ -101,7 +98,6 @@ GUIDED = [("fading", "guided"), ("fading", None), ("dying", "guided"), ("interru
         *((case, None, {}) for case in CASES),
         *((case, 4, {}) for case in (*CASES,)[:-1]),
         *((case, None, form) for case in ("fading", "topics") for form in FORMS),
-        *((case, None, {"actions": "guided", "fields": fields}) for case, fields in GUIDED),
     ],
 )
 def test_equal_to_gymnasiums_vector_of_single_environments(case: str, mode: Any, limit: Any, options: Any) -> None:

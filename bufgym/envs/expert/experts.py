@@ -24,8 +24,6 @@ def sub_envs_of(env: Any) -> SubEnvs:
     sub_envs = getattr(getattr(env, "unwrapped", env), "sub_envs", None)
     if not isinstance(sub_envs, SubEnvs):
         raise BufgymError(f"expert: {env!r} is no environment of bufgym, nor a native batch of them")
-    if sub_envs.options.acts_guided:
-        raise BufgymError("actions = 'guided': an expert answers with slots; make the environment with actions='slots'")
     return sub_envs
 
 

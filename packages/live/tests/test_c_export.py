@@ -103,7 +103,7 @@ def every_output() -> Policy:
     return GuidedWeights(weight).policy("every-output")
 
 
-AGENTS = {**{name: policies.get(name) for name in ("learned", "learned-ppo")}}
+AGENTS = {"learned": policies.get("learned")}
 AGENTS |= {"every-field": every_field(), "every-output": every_output()}
 AGENTS |= {
     "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
@@ -276,6 +276,6 @@ def test_a_field_without_c_is_refused_by_name_and_file(tmp_path, monkeypatch):
         assert cut != text
         (parts / part).write_text(cut, encoding="utf-8")
     monkeypatch.setattr(module, "_PARTS", parts)
-    for name, lacking in (("every-field", "load in features.h"), ("every-output", "guided_stall in inputs.h")):
+    for name, lacking in (("every-field", "load in features.h"), ("every-output", "rule_stall in inputs.h")):
         refuse(f"policy {name}: reads fields that have no C: {lacking}", header, AGENTS[name], 8, EXPONENTIAL)
     assert header(random_weights(("occupancy", "rank"), 7, seed=6).policy("few"), 8, EXPONENTIAL)

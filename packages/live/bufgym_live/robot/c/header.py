@@ -59,8 +59,8 @@ _CONSTANTS = {
     ruled_network: "EVEN_US EVEN",
 }
 """Constants that the parts name, by the module that has them."""
-_GUIDED = "guided_"
-"""Prefix under which a network reads the inputs of guided rules."""
+_RULE = "rule_"
+"""Prefix under which a network reads the inputs of the rule gap-price."""
 _VALUES = {EXPONENTIAL: "exponential", SATURATING: "saturating", TABULATED: "tabulated"}
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
@@ -159,7 +159,7 @@ def _rule(policy: Policy, guides: bool) -> str:
         known = ", ".join(SUPPORTED)
         raise BufgymError(f"policy {policy.name}: has no C; known: {known}, and learned agents for one queue")
     if guides:
-        _refuse_without_c(policy, [f"{_GUIDED}{name}" for name in guided.INPUTS])
+        _refuse_without_c(policy, [f"{_RULE}{name}" for name in guided.INPUTS])
     return _helped(_part("guided.h") if guides else (_RULES / f"{name}.h").read_text(encoding="utf-8"))
 
 
@@ -168,8 +168,8 @@ def without_c(fields: Iterable[str]) -> dict[str, str]:
     lacking = {}
     for name in fields:
         part, macro = "features.h", name.upper()
-        if name.startswith(_GUIDED):
-            part, macro = "inputs.h", f"IN_{name.removeprefix(_GUIDED).upper()}"
+        if name.startswith(_RULE):
+            part, macro = "inputs.h", f"IN_{name.removeprefix(_RULE).upper()}"
         if re.search(rf"\[BUFGYM_{macro}\](\[\w+\])? =\s", _part(part)) is None:
             lacking[name] = part
     return lacking
