@@ -91,7 +91,7 @@ class SubEnvs:
         if options.acts_on_candidates:
             self.choices = new_choices(n, options.candidates, options.asked_at == "arrival")
             self.actions_count = options.candidates + 1 + (options.asked_at == "arrival")
-        self.action_space = spaces.Discrete(self.actions_count)
+        self.action_space: Any = spaces.Discrete(self.actions_count)
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
         self.terms = terms_for(several_topics) + own_terms
