@@ -98,8 +98,9 @@ def _kind(cell: Cell) -> str:
     return "random-plain" if is_hopeful else "random"
 
 
-def _random(split: str, kind: str) -> list[Cell]:
-    found = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split]))
+def _random(split: str, kind: str, most: int = 96) -> list[Cell]:
+    first = FIRST_SEED[split]
+    found = map(random_stream, range(first, first + min(STREAMS[split], most)))
     return [cell for cell in found if _kind(cell) == kind]
 
 
@@ -132,13 +133,13 @@ FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
     "outage": _of_suite("outage-v1", (5, 15)),
     "heavy": _of_suite("jpeg-v1", (5, 10, 25), "heavy"),
     "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
-    "random": partial(_random, kind="random"),
     "interruption": _of_suite("interruption-v1", (1, 2, 5, 8, 16, 32)),
     "steady": _of_suite("sustained-v1", (1, 2, 3, 5, 8, 15, 32, 64)),
+    "random": partial(_random, kind="random"),
+    "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
+    "random-unequal": partial(_random, kind="random-unequal", most=48),
     "random-short": _short,
     "random-plain": partial(_random, kind="random-plain"),
-    "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
-    "random-unequal": partial(_random, kind="random-unequal"),
 }
 """Name -> cells of a split."""
 STAYING = ("interruption", "steady", "random-short", "random-plain", "unequal", "random-unequal")

@@ -85,6 +85,8 @@ FAMILY_NAMES = (
     "random",
     "unequal",
     "random-unequal",
+    "random-short",
+    "random-plain",
 )
 ALL = "all"
 
