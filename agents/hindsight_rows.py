@@ -118,7 +118,10 @@ class TaughtRows:
         self._observe()
 
     def _by_rule(self) -> NDArray[np.int64]:
-        """int64[n]: action 0 of families that the clairvoyant teaches, otherwise what the rule does."""
+        """int64[n]: action 0 of families that the clairvoyant teaches, otherwise what the rule does.
+
+        On an even link action 0 is not offered: there such a row accepts or rejects, as a queue does of itself.
+        """
         return np.where(self.stays[self.family], self.decisions[:, -1], self.decisions[:, 0])
 
     def scatter(self, rng: np.random.Generator) -> None:

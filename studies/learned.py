@@ -26,7 +26,7 @@ from studies.page import command, publish, table, written
 
 FOLDER = Path("runs/families")
 """Where the bounds of the families are kept."""
-TRAINING = "python train.py hindsight --families all"
+TRAINING = "python train.py hindsight --families all --steps 4000000 --validate-every 400000 --seed 1"
 RULES = ("target-gap", "price-dp", "gap-price")
 
 
