@@ -19,6 +19,7 @@ from agents.learner import Learner, learner_of
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
+from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.weights import save
 
 
@@ -54,7 +55,7 @@ class StillTheRule(Learner[Still]):
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> runs.Run:
         home, objective = folder / f"seed-{seed}", self.objective(folder, seed)
-        save(home / runs.MODEL, objective.start(), self.notes(seed, "still"))
+        save(home / runs.MODEL, GuidedWeights(np.zeros(GuidedWeights.SHAPE, np.float32)), self.notes(seed, "still"))
         run = runs.Run(seed, home, 0.0, [], [], runs.MODEL, objective.best)
         return dataclasses.replace(run, validation=[(0, 0.0, *objective.validate(self.agent(run)))])
 

@@ -214,14 +214,14 @@ async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.Monke
         assert (await viewer.next()).topic.startswith("/robots/robot-1/")
 
 
-def test_what_is_not_kept_another_process_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_cached_another_process_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     asked, code = list[tuple[str, ...]](), 0
 
     def compiling(*words: str) -> int:
         asked.append(words)
         return code
 
-    monkeypatch.setattr(policies, "kept", lambda chosen: False)
+    monkeypatch.setattr(policies, "is_cached", lambda chosen: False)
     monkeypatch.setattr(policies, "compiling", compiling)
     assert policies.compiled(registry.get("afr")).name == "afr"
     code = -2  # Ctrl-C
