@@ -37,11 +37,19 @@ def run_of(link: str, scenario: Any, seed: int, capacity: int, max_bytes: int | 
 
 
 def of_suite(
-    name: str, split: str, capacities: Sequence[int] = (), seeds: int = 1, every: int = 1, data: str | None = None
+    name: str,
+    split: str,
+    capacities: Sequence[int] = (),
+    seeds: int = 1,
+    every: int = 1,
+    data: str | None = None,
+    chosen: Callable[[str], bool] = lambda label: True,
 ) -> dict[str, list[Run]]:
     """The runs of a suite's scenarios by label, on every so many of its links; ``data``: folder of recordings."""
     suite, found = suites.get(name), {}
     for label, setting in suite.settings(split, data).items():
+        if not chosen(label):
+            continue
         found[label] = [
             run_of(trace, scenario, seed, L, setting.max_bytes)
             for trace, scenario in by_trace(setting.scenario)[::every]
@@ -51,9 +59,9 @@ def of_suite(
     return found
 
 
-def merged(found: dict[str, list[Run]], chosen: Callable[[str], bool] = lambda label: True) -> list[Run]:
-    """The runs of all labels that are chosen, by default of all."""
-    return [run for label, runs in found.items() if chosen(label) for run in runs]
+def merged(found: dict[str, list[Run]]) -> list[Run]:
+    """The runs of all labels."""
+    return [run for runs in found.values() for run in runs]
 
 
 class Family:

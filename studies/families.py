@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from agents.families import Run, merged, of_suite, run_of
 from agents.ready_families import FIRST_SEED, TASK_EPISODES, frames_over, random_stream
 from bufgym.scenario.numbered import by_trace
 from bufgym.scenario.uplink import uplink_over_lte
+from bufgym.utils.errors import unknown
 from bufgym.utils.files import replaced
 
 UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
@@ -38,17 +39,14 @@ def random_streams(split: str, count: int = 120) -> list[Run]:
     return [run_of(cell.label, cell.scenario, 0, cell.capacity) for cell in cells]
 
 
-def families(split: str, folder: Path, data: str | None = None) -> dict[str, list[Run]]:
-    """All families of the split "validation" or "test"; the bounds take minutes and are kept in ``folder``.
+def families(split: str, folder: Path, data: str | None = None, leave_out: Sequence[str] = ()) -> dict[str, list[Run]]:
+    """All families of the split "validation" or "test" but some; the bounds take minutes and are kept in ``folder``.
 
     With ``data``, a folder of recordings, there is one more: recorded uplinks.
     """
-    cameras: dict[str, list[Run]] = {}
 
     def camera(load: str, equal: bool) -> list[Run]:
-        if not cameras:
-            cameras.update(of_suite("jpeg-v1", split))
-        return merged(cameras, lambda label: load in label and ("equal" in label) == equal)
+        return merged(of_suite("jpeg-v1", split, chosen=lambda label: load in label and ("equal" in label) == equal))
 
     makers: dict[str, Callable[[], list[Run]]] = {
         "task": lambda: task(split),
@@ -70,6 +68,10 @@ def families(split: str, folder: Path, data: str | None = None) -> dict[str, lis
         ]
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
+    for name in leave_out:
+        if name not in makers:
+            raise unknown("family", name, makers)
+        del makers[name]
     for name, make in makers.items():
         kept = folder / f"{split}-{name}.pkl"  # only from your own run: pickles run code when they are read
         if not kept.exists():

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from agents.families import Family, Run
-from agents.tasks import FAMILY_NAMES
+from agents.tasks import FAMILY_NAMES, Names
 from bufgym import policies
 from bufgym.policies import Policy, weights
 from bufgym.policies.guided import N_INPUTS
@@ -53,6 +53,8 @@ the rule `gap-price`. It was made by `{command}`{seed}.
   decides.
 - *Keeps to the rule* on a link that has not varied for {even:.0f} seconds: there the rule alone is offered.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
+- *Sizes differ*: there it does what `gap-price` does. `bufgym bench --policies gap-price,learned --sizes jpeg` says
+  whether their rows are the same.
 - *Falls short* of a rule, by the intervals below: {short}.
 - *Trained* on {families} families of links and streams at once. [Training](guide/training.md) says how.
 
@@ -72,7 +74,9 @@ How far `learned` lies above {others}, with 95 % intervals over links:
 """
 
 
-def page(files: Sequence[Path], split: str, data: str | None, against: Path | None = None) -> str:
+def page(
+    files: Sequence[Path], split: str, data: str | None, against: Path | None = None, leave_out: Sequence[str] = ()
+) -> str:
     """The page of these agents, the one to ship first: its families, and its differences to rules and another agent."""
     network, notes = weights.read(files[0])
     if not isinstance(network, RuledWeights):
@@ -82,7 +86,7 @@ def page(files: Sequence[Path], split: str, data: str | None, against: Path | No
         rivals[against.stem] = policies.load(against)
     agents = [policies.load(file) for file in files]
     shares, less, sums, short = [], [], np.zeros(len(rivals) + len(agents)), []
-    for name, runs in split_up(families(split, FOLDER, data)).items():
+    for name, runs in split_up(families(split, FOLDER, data, leave_out)).items():
         found = Family(name, runs).against([*rivals.values(), *agents])
         above = dict(zip(rivals, found[len(rivals)][1], strict=False))
         shares.append([name, *(f"{share:.3f}" for share, _ in found)])
@@ -92,6 +96,7 @@ def page(files: Sequence[Path], split: str, data: str | None, against: Path | No
         print(" | ".join(shares[-1]), flush=True)
     shares.append(["mean", *(f"{total / len(less):.3f}" for total in sums)])
     more = (" --data DIR" if data else "") + (f" --against {against}" if against else "")
+    more += f" --leave-out {','.join(leave_out)}" if leave_out else ""
     return PAGE.format(
         **_described(network, notes),
         files=" ".join(map(str, files)),
@@ -129,6 +134,7 @@ def main(
     split: Literal["validation", "test"] = "validation",
     data: str | None = None,
     against: Path | None = None,
+    leave_out: Names = (),
     out: Path | None = None,
 ) -> None:
     """Compare agents for one queue with the rules, as a page.
@@ -138,11 +144,12 @@ def main(
         split: validation or test, of the links to compare on.
         data: folder of recordings, to compare on recorded uplinks as well.
         against: another agent, of any kind, with which the first is compared too.
+        leave_out: families to leave out, such as unequal-heavy,unequal-light, whose bounds take a quarter of an hour.
         out: the Markdown file; printed in any case.
     """
     if not files:
         raise BufgymError("name at least one file of an agent, such as agents/pretrained/learned.safetensors")
-    publish(page(files, split, data, against), out)
+    publish(page(files, split, data, against, leave_out), out)
 
 
 if __name__ == "__main__":
