@@ -140,6 +140,7 @@ def test_in_bursts_no_target_guides_the_outputs_and_the_plain_rule_stays(label, 
     assert same(ours, plain)
 
 
+@kernels
 @pytest.mark.parametrize("L", [1, 2, 3])
 def test_on_a_steady_link_the_smallest_outputs_keep_the_rule_of_a_short_queue(L):
     """One frame in ten leaves. Without the rule's own step for it all but the first that arrive are others."""
