@@ -79,16 +79,14 @@ def evaluated_on_a_worker(
         return _evaluated(_objective(settings, folder, seed), candidate, part)
 
 
-@functools.lru_cache(maxsize=32)  # several seeds, and runs one after the other, meet on one worker
-def _objective(settings: Evolve, folder: Path, seed: int) -> Evolved:
-    return objective_of(settings, folder, seed)
-
-
 def objective_of(settings: Evolve, folder: Path, seed: int) -> Evolved:
     """The task of a run for one seed."""
     found = OBJECTIVES[settings.kind](settings, folder, seed)
     assert isinstance(found, Evolved)
     return found
+
+
+_objective = functools.lru_cache(maxsize=32)(objective_of)  # several seeds and runs meet on one worker
 
 
 def _evaluated(objective: Evolved, candidate: GuidedWeights, part: int) -> tuple[float, int]:

@@ -6,9 +6,9 @@ their test splits. The splits share no link, but for ``task``: its validation ha
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -98,15 +98,18 @@ def _kind(cell: Cell) -> str:
     return "random-plain" if is_hopeful else "random"
 
 
+@functools.cache
+def _streams(split: str) -> list[Cell]:
+    return [random_stream(FIRST_SEED[split] + k) for k in range(STREAMS[split])]
+
+
 def _random(split: str, kind: str, most: int = 96) -> list[Cell]:
-    first = FIRST_SEED[split]
-    found = map(random_stream, range(first, first + min(STREAMS[split], most)))
-    return [cell for cell in found if _kind(cell) == kind]
+    return [cell for cell in _streams(split)[:most] if _kind(cell) == kind]
 
 
 def _short(split: str) -> list[Cell]:
     """Queues of one and of two places, under random streams and at the default frames."""
-    streams = map(random_stream, range(FIRST_SEED[split], FIRST_SEED[split] + STREAMS[split] // 4))
+    streams = _streams(split)[: STREAMS[split] // 4]
     found = [Cell(cell.label, cell.scenario, 1 + k % 2) for k, cell in enumerate(streams)]
     return [*found, *_frames(split, (1, 2))]
 
@@ -135,11 +138,11 @@ FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
     "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
     "interruption": _of_suite("interruption-v1", (1, 2, 5, 8, 16, 32)),
     "steady": _of_suite("sustained-v1", (1, 2, 3, 5, 8, 15, 32, 64)),
-    "random": partial(_random, kind="random"),
+    "random": functools.partial(_random, kind="random"),
     "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
-    "random-unequal": partial(_random, kind="random-unequal", most=48),
+    "random-unequal": functools.partial(_random, kind="random-unequal", most=48),
     "random-short": _short,
-    "random-plain": partial(_random, kind="random-plain"),
+    "random-plain": functools.partial(_random, kind="random-plain"),
 }
 """Name -> cells of a split."""
 STAYING = ("interruption", "steady", "random-short", "random-plain", "unequal", "random-unequal")

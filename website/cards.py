@@ -32,7 +32,9 @@ CARDS = {
         sees="the queue, the clock, the socket, V, sizes, the link's rate, and odometry where there is any",
         kind="a network among ordered candidates and the decision of the rule `gap-price`",
         limits="trained on camera streams of one topic",
-        fails="On a link that has not varied for three seconds it is the rule `gap-price`.",
+        fails="On LTE links, generated links, recorded uplinks and in outages it cannot be told from the rule"
+        " `target-gap`; in interruptions, for unequal sizes and on a link that has not varied for three seconds it is"
+        " the rule `gap-price`.",
     ),
     "learned-scheduler": Card(
         results="topics.md",

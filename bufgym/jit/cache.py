@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from numba.core import compiler, serialize
 
-from bufgym.jit.folder import CACHED_ONLY, CACHED_VERSIONS, FOLDER, NotCachedError, readable_name, state
+from bufgym.jit.folder import CACHED_ONLY, FOLDER, NotCachedError, delete_old, readable_name, state
 from bufgym.utils.files import replaced
 
 
@@ -45,10 +45,7 @@ class Code:
             # Whole or not at all: another process may read it at this moment.
             with replaced(file) as part:
                 part.write_bytes(cast(Any, serialize).dumps(result._reduce()))
-            # Another process may delete one of them meanwhile; that is an OSError, too, and does no harm.
-            versions = sorted(file.parent.glob(f"{self._name}-*.nbc"), key=lambda path: path.stat().st_mtime)
-            for old in versions[:-CACHED_VERSIONS]:
-                old.unlink(missing_ok=True)
+            delete_old(self._name)
 
     def _file(self, signature: Any, generator: Any) -> Path:
         return Path(FOLDER, f"{self._name}-{state(self._function, signature, generator.magic_tuple())}.nbc")

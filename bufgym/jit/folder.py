@@ -52,7 +52,9 @@ FOLDER = _cache_folder()
 _COMPILER = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(Path(__file__).parent.glob("*.py"))]
 _TOOLS = (sys.implementation.cache_tag, numba.__version__, llvmlite.__version__, np.__version__, *_COMPILER)
 """Versions of all that translates kernels, and the sources of this package."""
-CACHED_VERSIONS = 16  # most files of one kernel: one for each set of argument types and each state of its sources
+CACHED_VERSIONS = (
+    16  # most files or folders of one kernel: one for each set of argument types and each state of its sources
+)
 
 
 def readable_name(function: Any, role: str) -> str:
@@ -68,6 +70,14 @@ def state(function: Any, signature: Any, *more: Any) -> str:
     """
     depends_on = repr((_TOOLS, fingerprint(function), spelled_types(signature), *more))
     return hashlib.sha256(depends_on.encode()).hexdigest()[:20]
+
+
+def delete_old(name: str) -> None:
+    """Delete a kernel's oldest code, files or folders."""
+    with contextlib.suppress(OSError):  # another process may delete one of them meanwhile
+        versions = sorted(Path(FOLDER).glob(f"{name}-*"), key=lambda path: path.stat().st_mtime)
+        for old in versions[:-CACHED_VERSIONS]:
+            shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
 
 
 def spelled_types(types: Any) -> str:

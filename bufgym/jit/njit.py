@@ -18,7 +18,7 @@ from llvmlite import binding
 from numba.core import compiler, untyped_passes
 
 from bufgym.jit import announce
-from bufgym.jit.folder import CACHED_ONLY, CACHED_VERSIONS, FOLDER, NotCachedError, readable_name, state
+from bufgym.jit.folder import CACHED_ONLY, FOLDER, NotCachedError, delete_old, readable_name, state
 from bufgym.jit.none_fields import NoneFields
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -109,7 +109,8 @@ def _cached(dispatcher: Any, role: str) -> Any:
                 with contextlib.suppress(Exception):
                     _use(folder, dispatcher)
                 result = compile_uncached(signature)
-        _delete_old(name)
+        if not is_cached:
+            delete_old(name)
         return result
 
     dispatcher.compile = compile_cached
@@ -124,14 +125,6 @@ def _use(folder: Path, dispatcher: Any) -> None:
             dispatcher.enable_caching()
         finally:
             _numba.config.CACHE_DIR = before
-
-
-def _delete_old(name: str) -> None:
-    """Delete a kernel's oldest folders."""
-    with contextlib.suppress(OSError):  # another process may delete one of them meanwhile
-        versions = sorted(Path(FOLDER).glob(f"{name}-*/"), key=lambda path: path.stat().st_mtime)
-        for old in versions[:-CACHED_VERSIONS]:
-            shutil.rmtree(old, ignore_errors=True)
 
 
 def kernel(function: Function) -> Function:
