@@ -145,15 +145,13 @@ def write_observation(batch: Batch, i: int, ended: bool, output: StepOutput, cho
         arrival = batch.arrivals[i, min(sender.next, sender.arrivals - 1)]
         first = _ALL_SLOT_FIELDS * entries
         if entries > 0:
-            observe_topic_slots(
-                buffer, arrival, arriving, unchecked_table(output.flat, i, 0, _ALL_SLOT_FIELDS, entries)
-            )
+            observe_topic_slots(buffer, arrival, arriving, unchecked_table(output.flat[i], _ALL_SLOT_FIELDS, entries))
         observe_topic_context(buffer, arrival, arriving, unchecked_slice(output.flat, i, first, _ALL_CONTEXT_FIELDS))
     elif chosen is None:
         arrival = arrival_of(batch, i)
         first = _SLOT_FIELDS * entries
         rows, context = (
-            unchecked_table(output.flat, i, 0, _SLOT_FIELDS, entries),
+            unchecked_table(output.flat[i], _SLOT_FIELDS, entries),
             unchecked_slice(output.flat, i, first, _CONTEXT_FIELDS),
         )
         observe(buffer, arrival, rows, context)

@@ -1,6 +1,7 @@
-"""A notice on stderr when compiling takes long."""
+"""What goes on around compiling: a notice on stderr when it takes long, and no garbage collection."""
 
 import contextlib
+import gc
 import sys
 import threading
 from collections.abc import Iterator
@@ -26,8 +27,11 @@ def compile_silently() -> None:
 
 
 @contextlib.contextmanager
-def if_long() -> Iterator[None]:
+def compiling() -> Iterator[None]:
     """Write the notice if the block, which compiles a kernel, takes long."""
+    # Numba makes objects by the million and drops few: searching them for garbage is a tenth of the time.
+    collects = gc.isenabled()
+    gc.disable()
     notice = threading.Timer(PATIENCE_S, say)
     notice.daemon = True
     notice.start()
@@ -35,3 +39,5 @@ def if_long() -> Iterator[None]:
         yield
     finally:
         notice.cancel()
+        if collects:
+            gc.enable()

@@ -47,9 +47,9 @@ def unchecked_slice(array: NDArray[Any], i: int, first: int, length: int) -> Any
     return array[i, first : first + length]
 
 
-def unchecked_table(array: NDArray[Any], i: int, first: int, rows: int, columns: int) -> Any:
-    """``array[i, first : first + rows * columns]`` as rows x columns, of an array in C order."""
-    return array[i, first : first + rows * columns].reshape(rows, columns)
+def unchecked_table(array: NDArray[Any], rows: int, columns: int) -> Any:
+    """``array[: rows * columns]`` as rows x columns, of an array of one axis whose numbers lie side by side."""
+    return array[: rows * columns].reshape(rows, columns)
 
 
 def prefetch(array: NDArray[Any], i: int, k: int) -> None:

@@ -44,11 +44,13 @@ def _read(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 def _view(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     """LLVM's code of ``unchecked_slice`` and ``unchecked_table``."""
-    kind, (array, i, first, *shape) = signature.args[0], arguments
+    kind, array = signature.args[0], arguments[0]
+    # The first one's arguments are array, i, first and length, the other's are array, rows and columns.
+    start, shape = ((*arguments[1:3],), arguments[3:]) if kind.ndim == 2 else ((), arguments[1:])
     whole, view = _opened(context, builder, kind, array), _opened(context, builder, signature.return_type)
     # Strides of an array in C order, bytes.
     strides = [*(builder.mul(columns, whole.itemsize) for columns in shape[1:]), whole.itemsize]
-    view.data = _place(context, builder, kind, array, (i, first))
+    view.data = _place(context, builder, kind, array, start) if start else whole.data
     view.shape, view.strides = (cast(Any, cgutils).pack_array(builder, numbers) for numbers in (shape, strides))
     view.nitems = shape[0] if len(shape) == 1 else builder.mul(*shape)
     view.itemsize, view.meminfo, view.parent = whole.itemsize, whole.meminfo, whole.parent
@@ -76,5 +78,5 @@ def _compile_as(function: Callable[..., Any], typer: Callable[..., Any], code: C
 _compile_as(unchecked_item, lambda array, k: array.dtype, _read)
 _compile_as(unchecked_at, lambda array, i, k: array.dtype, _read)
 _compile_as(unchecked_slice, lambda array, i, first, length: array.copy(ndim=1), _view)
-_compile_as(unchecked_table, lambda array, i, first, rows, columns: array.copy(ndim=2), _view)
+_compile_as(unchecked_table, lambda array, rows, columns: array.copy(ndim=2, layout="C"), _view)
 _compile_as(prefetch, lambda array, i, k: numba.types.void, _hint)

@@ -95,7 +95,7 @@ def _cached(dispatcher: Any, role: str) -> Any:
         is_cached = any(folder.rglob("*.nbc"))
         if CACHED_ONLY.get() and not is_cached:
             raise NotCachedError
-        with contextlib.nullcontext() if is_cached else announce.if_long(), warnings.catch_warnings():
+        with contextlib.nullcontext() if is_cached else announce.compiling(), warnings.catch_warnings():
             warnings.simplefilter("ignore", _numba.core.errors.NumbaWarning)  # of code that cannot be cached
             try:
                 _use(folder, dispatcher)

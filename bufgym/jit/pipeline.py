@@ -38,7 +38,7 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
             return super().compile_extra(function)
         numbas = cast(Any, config)
         level = numbas.OPT
-        with announce.if_long():
+        with announce.compiling():
             try:
                 # A global of Numba's, safe to set while the compiler's lock is held.
                 numbas.OPT = 2  # LLVM's level; 3 takes longer, and the code is no faster

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import kernel
+from bufgym.jit import kernel, unchecked_table
 
 HEADER = 5
 """Numbers before the fields: fields read, the context's share of them, widths of both layers, size of one network."""
@@ -76,7 +76,7 @@ def divide(memory: NDArray[np.float64], scorer: Scorer, contexts: int, slots: in
     h = skip + len(scorer.fields) - scorer.context
     context = h + 2 * scorer.first + scorer.second
     rows = context + contexts
-    table = memory[rows : rows + slots * (capacity + 1)].reshape((slots, capacity + 1))
+    table = unchecked_table(memory[rows:], slots, capacity + 1)
     return Scratch(memory[:skip], memory[skip:h], memory[h:context], memory[context:rows], table)
 
 

@@ -103,6 +103,19 @@ class Motion:
 
 
 @kernel
+def _before(knot_us: Int64Array, t: int) -> int:
+    """Index of the last knot at or before ``t``; at least one is."""
+    low, high = 0, len(knot_us)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if knot_us[middle] <= t:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@kernel
 def _follow(knot_us: Int64Array, y: Float64Array, time_us: Int64Array, start_us: int, coordinate: Float64Array) -> int:
     """Do what ``Motion.follow`` says; return the first negative time, or 0."""
     duration_us, j = knot_us[-1], 0
@@ -116,7 +129,7 @@ def _follow(knot_us: Int64Array, y: Float64Array, time_us: Int64Array, start_us:
         if t >= knot_us[j + 1]:
             j += 1  # the usual case: times in order, about as far apart as the samples
         if not knot_us[j] <= t < knot_us[j + 1]:
-            j = np.searchsorted(knot_us, t, "right") - 1
+            j = _before(knot_us, t)
         slope = (y[j + 1] - y[j]) / (knot_us[j + 1] - knot_us[j])
         coordinate[k] = gone + (slope * (t - knot_us[j]) + y[j])
     return 0

@@ -98,7 +98,7 @@ def third(array):
 @kernel
 def corner(table, i):
     jit.prefetch(table, i, 0)
-    rows = unchecked_table(table, i, 1, 2, 3)  # rows 1..3 and 4..6 of the row's 7 numbers
+    rows = unchecked_table(unchecked_slice(table, i, 1, 6), 2, 3)  # rows 1..3 and 4..6 of the row's 7 numbers
     return 1000 * unchecked_at(table, i, 6) + 100 * rows[1, 2] + rows[0, 1] + unchecked_slice(table, i, 5, 2)[0]
 
 @kernel

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import kernel, unchecked_item
+from bufgym.jit import kernel, unchecked_item, unchecked_table
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.observe.declare import Field, writer
 from bufgym.model.qoi import merging_loss, value
@@ -214,7 +214,7 @@ QUEUE_FIELDS = (
     Field("queue_medium_rate", "context", "link", _RATIO, "log(link's rate over 0.5 s / r)",
           lambda buffer, arrival, q: times(q.medium, q.per_rate), -MOST, MOST),
     Field("queue_carried", "context", "link", _RATIO, "log(messages that the link carries in p at r) + 2",
-          lambda buffer, arrival, q: times(q.rate * q.period_us * math.e**2, q.per_size),
+          lambda buffer, arrival, q: times(q.rate * q.period_us * (math.e * math.e), q.per_size),
           -MOST, MOST),
     Field("queue_step", "context", "motion", _RATIO, "log(motion since the previous arrival / e) + 1",
           lambda buffer, arrival, q: times(q.step * math.e, q.per_even), -MOST, MOST),
@@ -259,7 +259,7 @@ def observe_candidates(
     """
     s, places = len(buffer.slots), len(order)
     first = _FLAGS * places
-    rows, context = numbers[: _FIELDS * places].reshape((_FIELDS, places)), numbers[_FIELDS * places :]
+    rows, context = unchecked_table(numbers, _FIELDS, places), numbers[_FIELDS * places :]
     even = (arrival.x - buffer.dequeued_x) / (buffer.capacity + 1)
     step, per_even = arrival.x - buffer.previous_x, inverse(even)
     for column in range(places):
