@@ -8,12 +8,15 @@ limit bytes in flight instead, to one buffer a round trip.
 
 import asyncio
 import contextlib
+import errno
 import os
 import select
 import socket
 import stat
 import struct
 import sys
+from collections.abc import Callable
+from ipaddress import ip_address
 from typing import Any, Final
 
 UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
@@ -63,10 +66,10 @@ def bounded_backoff(connection: socket.socket, most_s: float) -> bool:
     return True
 
 
-def address_to(connection: socket.socket) -> str | None:
+def address_to(peer: Any, family: int = socket.AF_INET) -> str | None:
     """This machine's address from which a new connection to the peer would leave; None if no way leads there."""
-    with contextlib.suppress(OSError), socket.socket(connection.family, socket.SOCK_DGRAM) as probe:
-        probe.connect(connection.getpeername())  # which sends nothing
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect(peer)  # which sends nothing
         return str(probe.getsockname()[0])
     return None
 
@@ -74,9 +77,23 @@ def address_to(connection: socket.socket) -> str | None:
 def moved_to(connection: socket.socket) -> str | None:
     """This machine's new address, if a connection that it made would now leave from another one."""
     with contextlib.suppress(OSError):
-        new = address_to(connection)
+        new = address_to(connection.getpeername(), connection.family)
         return None if new == connection.getsockname()[0] else new
     return None
+
+
+def is_gone(address: str) -> bool:
+    """Whether no interface of this machine has this address; False for a name."""
+    try:
+        family = socket.AF_INET6 if ip_address(address).version == 6 else socket.AF_INET
+    except ValueError:
+        return False
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, 0))
+        except OSError as error:
+            return error.errno == errno.EADDRNOTAVAIL
+    return False
 
 
 async def until_writable(connection: Any) -> None:
@@ -101,13 +118,25 @@ def is_writable(connection: socket.socket, patience_s: float) -> bool:
 def connections_to(host: str, port: int) -> dict[int, socket.socket]:
     """This process's TCP connections to there, by inode, also those of libraries; none where the system hides them."""
     peers = {address[:2] for *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+    return _connections(lambda one: _peer(one) in peers)
+
+
+def end_connections_from(address: str) -> None:
+    """End this process's TCP connections from this address, which is gone: whoever waits for them learns of it."""
+    for one in _connections(lambda one: _peer(one) is not None and one.getsockname()[0] == address).values():
+        with one, contextlib.suppress(OSError):
+            one.shutdown(socket.SHUT_RDWR)
+
+
+def _connections(chosen: Callable[[socket.socket], bool]) -> dict[int, socket.socket]:
+    """The chosen ones of this process's sockets, each with a new descriptor, by inode."""
     found: dict[int, socket.socket] = {}
     for name in os.listdir("/proc/self/fd") if os.path.isdir("/proc/self/fd") else ():
         with contextlib.suppress(OSError):  # a descriptor that was closed meanwhile
             about = os.stat(f"/proc/self/fd/{name}")
             if stat.S_ISSOCK(about.st_mode) and about.st_ino not in found:
                 one = socket.socket(fileno=os.dup(int(name)))
-                if _peer(one) in peers:
+                if one.type == socket.SOCK_STREAM and chosen(one):
                     found[about.st_ino] = one
                 else:
                     one.close()

@@ -14,6 +14,7 @@ import xmlrpc.client
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 import roscpp_cases
@@ -28,17 +29,25 @@ from bufgym_live.robot.sockets import bounded_backoff
 from bufgym_live.robot.tunnel import ADDRESSES, End, Tunnel
 
 NEAR, FAR = ADDRESSES
+MOVED = "10.79.0.3"
 PORT, MASTER = 7410, 11311
-DEAD_S, SOON_S = 20.0, 3.0
+DEAD_S, NO_LINK_S, SOON_S = 20.0, 2.0, 3.0
 CAMERA = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
 NODE = """
 import rospy
 from std_msgs.msg import String
 rospy.init_node("camera")
+rospy.Subscriber("odom", rospy.AnyMsg, print)
 publisher, rate = rospy.Publisher("camera", String, queue_size=5), rospy.Rate(50)
 while not rospy.is_shutdown():
     publisher.publish(String(data="x" * 1000))
     rate.sleep()
+"""
+SUBSCRIBER = """
+import rospy
+rospy.init_node("viewer")
+rospy.Subscriber("camera", rospy.AnyMsg, lambda message: print("message"), queue_size=5)
+rospy.spin()
 """
 
 
@@ -87,10 +96,10 @@ def at(end: End, work: Callable[[], Any]) -> threading.Thread:
     return thread
 
 
-def program(end: End, *words: Any, **settings: str) -> "subprocess.Popen[str]":
+def program(end: End, *words: Any, stdout: int = subprocess.DEVNULL, **settings: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         list(map(str, words)), env={**os.environ, **settings}, preexec_fn=end.enter, text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        stdin=subprocess.PIPE, stdout=stdout, stderr=subprocess.DEVNULL,
     )  # fmt: skip
 
 
@@ -112,7 +121,7 @@ class Far:
 
 def new_address() -> None:
     """What a robot meets that comes into another network."""
-    for verb, address in (("del", NEAR), ("add", "10.79.0.3")):
+    for verb, address in (("del", NEAR), ("add", MOVED)):
         subprocess.run(["ip", "addr", verb, f"{address}/24", "dev", "bufgym0"], check=True)
 
 
@@ -143,7 +152,7 @@ def test_a_robots_new_address_is_a_new_connection(between: tuple[Tunnel, Wire]) 
     queue.close()
     sending.join(60)
     assert len(far.came) == 20
-    assert "this machine's address has become 10.79.0.3" in senders[0].faults[0]
+    assert f"this machine's address has become {MOVED}" in senders[0].faults[0]
 
 
 def test_the_kernel_bounds_its_backoff_or_says_that_it_cannot() -> None:
@@ -181,25 +190,39 @@ def ros2_send(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
 
 
 def ros1(made: Tunnel, folder: Path, talker: list[Any], **settings: str) -> tuple[list[float], list[Any]]:
-    where = {"ROS_MASTER_URI": f"http://{NEAR}:{MASTER}", "ROS_IP": NEAR, "ROS_HOME": str(folder), **settings}
-    started = [program(made.near, "rosmaster", "--core", "-p", MASTER, **where)]
-    started.append(program(made.near, *talker, **where))
+    """The talker at the near end; at the far one ROS 1's master and a subscriber, which prints a line a message."""
+    if not (SYSTEM / "rospy").is_dir():
+        pytest.skip(needs("ros1"))
+    where = {**environment(folder), "ROS_MASTER_URI": f"http://{FAR}:{MASTER}", "ROS_HOME": str(folder)}
+    (folder / "subscriber.py").write_text(SUBSCRIBER)
+    words = (sys.executable, "-u", folder / "subscriber.py")
+    hears = program(made.far, *words, stdout=subprocess.PIPE, **where, ROS_IP=FAR)
     came: list[float] = []
 
     def hear() -> None:
-        with xmlrpc.client.ServerProxy(f"http://{NEAR}:{MASTER}") as proxy:
-            master: Any = proxy
-            while not roscpp_cases.publishers(master, "camera"):
-                time.sleep(0.1)
-            connection = roscpp_cases.subscriber(master, "camera")
-        connection.settimeout(120)
-        with connection, contextlib.suppress(OSError, EOFError):  # until the talker is killed
-            while True:
-                roscpp_cases.block(connection)
-                came.append(time.monotonic())
+        for _ in hears.stdout or ():
+            came.append(time.monotonic())
 
-    at(made.far, hear)
-    return came, started
+    threading.Thread(target=hear, daemon=True).start()
+    master = program(made.far, "rosmaster", "--core", "-p", MASTER, **where, ROS_IP=FAR)
+    return came, [master, hears, program(made.near, *talker, **where, ROS_IP=NEAR, **settings)]
+
+
+def registered(made: Tunnel) -> tuple[str, str, set[tuple[int, str]]]:
+    """What the far end's master says: the talker's address, that of its services, and all that it has registered."""
+    found: list[tuple[str, str, set[tuple[int, str]]]] = []
+
+    def ask() -> None:
+        with xmlrpc.client.ServerProxy(f"http://{FAR}:{MASTER}") as proxy:
+            master: Any = proxy
+            [talker] = roscpp_cases.publishers(master, "camera")
+            state = enumerate(master.getSystemState("/test")[2])
+            names = {(kind, name) for kind, part in state for name, nodes in part if talker in nodes}
+            hosts = master.lookupNode("/test", talker)[2], master.lookupService("/test", f"{talker}/get_loggers")[2]
+            found.append((*(str(urlsplit(host).hostname) for host in hosts), names))  # type: ignore[arg-type]
+
+    at(made.far, ask).join()
+    return found[0]
 
 
 def node_in_cpp(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
@@ -207,15 +230,12 @@ def node_in_cpp(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
         pytest.skip(needs("roscpp", reason))
     library = roscpp_cases.build(folder, "afr")
     words = [folder / "talker", "camera", 5, 6000, 1000, 50]
-    return ros1(made, folder, words, LD_PRELOAD=str(library), BUFGYM_POLICY="afr")
+    return ros1(made, folder, words, LD_PRELOAD=str(library), BUFGYM_POLICY="afr", BUFGYM_ODOMETRY="/odom")
 
 
 def node_in_python(made: Tunnel, folder: Path) -> tuple[list[float], list[Any]]:
-    if not (SYSTEM / "rospy").is_dir():
-        pytest.skip(needs("ros1"))
     (folder / "node.py").write_text(NODE)
-    words = [sys.executable, "-m", "bufgym_live.robot.ros1", "--policy", "afr", folder / "node.py"]
-    return ros1(made, folder, words, **environment(folder))
+    return ros1(made, folder, [sys.executable, "-m", "bufgym_live.robot.ros1", "--policy", "afr", folder / "node.py"])
 
 
 @pytest.mark.nightly
@@ -241,19 +261,26 @@ def test_frames_come_soon_after_a_link_that_was_dead(way: Any, between: tuple[Tu
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("way", [live, sender_in_cpp, ros2_send])
+@pytest.mark.parametrize("way", [live, sender_in_cpp, ros2_send, node_in_cpp, node_in_python])
 def test_frames_come_soon_after_a_new_address(way: Any, between: tuple[Tunnel, Wire], tmp_path: Path) -> None:
-    """Without a look at its address a sender is silent until TCP gives up. ROS 1's subscribers know the old address."""
-    made, _ = between
+    """Without a look at its address a sender is silent until TCP gives up, and a node of ROS 1 for ever."""
+    made, wire = between
     came, started = way(made, tmp_path)
     try:
         waited(lambda: len(came) > 20)
+        known = registered(made) if way in (node_in_cpp, node_in_python) else None
+        wire.cut.set()
         at(made.near, new_address).join()
+        time.sleep(NO_LINK_S)  # between two networks: what is tried meanwhile fails
+        wire.cut.clear()
         before, changed_s = len(came), time.monotonic()
         waited(lambda: len(came) > before + 20)  # more than was on its way
         silent_s = max(b - a for a, b in itertools.pairwise([changed_s, *came[before:]]))
         print(way.__name__, silent_s)
         assert silent_s < SOON_S
+        if known is not None:  # the node can still be called, stopped and sent messages to
+            assert known[:2] == (NEAR, NEAR) and {(0, "/camera"), (1, "/odom")} <= known[2]
+            waited(lambda: registered(made) == (MOVED, MOVED, known[2]))
     finally:
         for one in started:
             one.kill()

@@ -77,6 +77,7 @@ def install(
     from bufgym.model.checks import between
     from bufgym_live.robot import LogFile, PolicyQueue
     from bufgym_live.robot.odometry import followed
+    from bufgym_live.robot.ros1 import new_address
     from bufgym_live.robot.ros1.connection import PolicyConnection
 
     between("backoff_s", backoff_s, LEAST_BACKOFF_S, MOST_BACKOFF_S, "s")
@@ -107,6 +108,7 @@ def install(
         return PolicyConnection(connection, queue, moved.x, file, backoff_s)
 
     rospy_topics.QueuedConnection = queued
+    new_address.watch()
 
 
 def _warm_up(policy: Any, value: Value) -> None:

@@ -2,8 +2,8 @@
 //
 //   LD_PRELOAD=libbufgym_roscpp.so BUFGYM_POLICY=learned rosrun ...      (settings.h has all settings)
 //
-// It takes the place of three functions of ros::TransportSubscriberLink that libroscpp exports: enqueueMessage,
-// startMessageWrite and onMessageWritten. Calls to them go through vtable, PLT and GOT, so the library that is loaded
+// It takes the place of functions that libroscpp exports: of ros::TransportSubscriberLink enqueueMessage,
+// startMessageWrite and onMessageWritten, and of ros::network::getHost. Calls to them go through vtable, PLT and GOT, so the library that is loaded
 // first has them. roscpp's class is the same from indigo to noetic (transport_subscriber_link.h of ros_comm at
 // indigo-devel, kinetic-devel, melodic-devel and noetic-devel); its Boost headers must be the robot's own.
 #include <algorithm>
@@ -40,21 +40,21 @@
 #include "link.h"
 #include "log.h"
 #include "motion.h"
+#include "named.h"
+#include "new_address.h"
 #include "policy.h"
 #include "settings.h"
 
-namespace
+namespace bufgym
 {
-// A private member of another class may be named in an explicit instantiation.
-template <class Key, typename Key::type POINTER> struct Named { friend typename Key::type pointer(Key) { return POINTER; } };
-#define NAMED(KEY, CLASS, TYPE, MEMBER)                                                  \
-  struct KEY { typedef TYPE CLASS::*type; friend type pointer(KEY); };                   \
-  template struct Named<KEY, &CLASS::MEMBER>;
 NAMED(Socket, ros::TransportTCP, int, sock_)
 NAMED(Written, ros::Connection, uint32_t, write_sent_)
 NAMED(ToWrite, ros::Connection, uint32_t, write_size_)
 NAMED(Ending, ros::TopicManager, boost::mutex, shutting_down_mutex_)
+}
 
+namespace
+{
 const int DEAD_MS = 900000;  // the subscriber alone can connect again, and is not told, so a connection stays for 15 min
 const int UNSENT_BYTES = 16384;  // the system wants more when less than this is unsent, whatever is in flight
 
@@ -84,7 +84,7 @@ struct Odometry
     {
       const ros::TopicManagerPtr &topics = ros::TopicManager::instance();
       // The node's end waits meanwhile: before noetic it takes subscribe's two locks the other way round.
-      boost::mutex::scoped_lock lock(topics.get()->*pointer(Ending()));
+      boost::mutex::scoped_lock lock(topics.get()->*pointer(bufgym::Ending()));
       refused = ros::isShuttingDown() || !topics->subscribe(options);
     }
     catch (const ros::Exception &error)  // the node itself has the topic with another type
@@ -104,6 +104,12 @@ struct Odometry
     motion.take(message->header.frame_id, message->header.stamp.toSec(), {p.x, p.y, p.z}, {o.x, o.y, o.z, o.w});
   }
 };
+
+bufgym::Registration &registration()
+{
+  static auto *all = new bufgym::Registration;
+  return *all;
+}
 
 bufgym::Motion *motion()
 {
@@ -173,7 +179,7 @@ void begin(State &state, ros::TransportSubscriberLink *link, int capacity)
     ROS_WARN("bufgym: %s: queue_size %d is over %d: roscpp's own queue stays", topic.c_str(), capacity, bufgym::MOST);
     return;
   }
-  state.socket = tcp->*pointer(Socket());
+  state.socket = tcp->*pointer(bufgym::Socket());
   if (!settings().local && is_local(state.socket))
     return;
   state.first_us = bufgym::now_us();
@@ -207,7 +213,7 @@ int64_t carried(State &state, const ros::Connection &connection)
     return state.carried;
   int unsent = 0;
   ioctl(state.socket, SIOCOUTQNSD, &unsent);
-  const int64_t left = unsent + int64_t(connection.*pointer(ToWrite()) - connection.*pointer(Written()));
+  const int64_t left = unsent + int64_t(connection.*pointer(bufgym::ToWrite()) - connection.*pointer(bufgym::Written()));
   state.carried = std::max(state.carried, std::min(state.dequeued_bytes - 1, state.dequeued_bytes - left));
   return state.carried;
 }
@@ -232,6 +238,13 @@ bool keeps(State &state, std::deque<ros::SerializedMessage> &box, int64_t size_b
 
 namespace ros
 {
+// roscpp asks when its node starts, and whenever it tells somebody where to connect to.
+const std::string &network::getHost()
+{
+  registration().watch();
+  return registration().host();
+}
+
 void TransportSubscriberLink::enqueueMessage(const SerializedMessage &m, bool ser, bool)
 {
   if (!ser)

@@ -1,10 +1,14 @@
 // A TCP connection over a link that dies and comes back, and under a robot whose address changes (robot/sockets.py).
 #ifndef BUFGYM_ROSCPP_LINK_H
 #define BUFGYM_ROSCPP_LINK_H
+#include <cerrno>
+#include <cstdlib>
 #include <cstring>
 #include <string>
 
 #include <arpa/inet.h>
+#include <dirent.h>
+#include <netdb.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <sys/socket.h>
@@ -39,20 +43,74 @@ inline std::string host_of(const sockaddr_storage &address)
   return text;
 }
 
+// This machine's address from which a connection to the peer would leave; empty if no way leads there.
+inline std::string address_to(const sockaddr *peer, socklen_t peer_size)
+{
+  sockaddr_storage now = {};
+  socklen_t size = sizeof now;
+  const int probe = socket(peer->sa_family, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  const bool known = probe >= 0 && !connect(probe, peer, peer_size) &&
+                     !getsockname(probe, reinterpret_cast<sockaddr *>(&now), &size);  // which sends nothing
+  if (probe >= 0)
+    close(probe);
+  return known ? host_of(now) : "";
+}
+
+// The same for a host's name or address.
+inline std::string address_to(const std::string &host)
+{
+  addrinfo *found = nullptr, hints = {};
+  hints.ai_socktype = SOCK_DGRAM;
+  if (getaddrinfo(host.c_str(), "11311", &hints, &found))
+    return "";
+  const std::string from = address_to(found->ai_addr, found->ai_addrlen);
+  freeaddrinfo(found);
+  return from;
+}
+
 // This machine's new address, if a connection that it made to the peer would now leave from another one; else empty.
 inline std::string moved_to(int connection)
 {
-  sockaddr_storage own = {}, peer = {}, now = {};
-  socklen_t size = sizeof own, peer_size = sizeof peer, now_size = sizeof now;
+  sockaddr_storage own = {}, peer = {};
+  socklen_t size = sizeof own, peer_size = sizeof peer;
   if (getsockname(connection, reinterpret_cast<sockaddr *>(&own), &size) ||
       getpeername(connection, reinterpret_cast<sockaddr *>(&peer), &peer_size))
     return "";
-  const int probe = socket(peer.ss_family, SOCK_DGRAM | SOCK_CLOEXEC, 0);
-  const bool known = probe >= 0 && !connect(probe, reinterpret_cast<sockaddr *>(&peer), peer_size) &&
-                     !getsockname(probe, reinterpret_cast<sockaddr *>(&now), &now_size);  // which sends nothing
+  const std::string now = address_to(reinterpret_cast<const sockaddr *>(&peer), peer_size);
+  return now != host_of(own) ? now : "";
+}
+
+// Whether no interface of this machine has this address; false for a name.
+inline bool is_gone(const std::string &address)
+{
+  addrinfo *found = nullptr, hints = {};
+  hints.ai_flags = AI_NUMERICHOST;
+  hints.ai_socktype = SOCK_DGRAM;
+  if (getaddrinfo(address.c_str(), nullptr, &hints, &found))
+    return false;
+  const int probe = socket(found->ai_family, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  const bool gone = probe >= 0 && bind(probe, found->ai_addr, found->ai_addrlen) && errno == EADDRNOTAVAIL;
   if (probe >= 0)
     close(probe);
-  return known && host_of(now) != host_of(own) ? host_of(now) : "";
+  freeaddrinfo(found);
+  return gone;
+}
+
+// End this process's TCP connections from this address, which is gone: whoever waits for them learns of it.
+inline void end_connections_from(const std::string &address)
+{
+  DIR *all = opendir("/proc/self/fd");
+  while (const dirent *one = all ? readdir(all) : nullptr)
+  {
+    const int socket = std::atoi(one->d_name);
+    sockaddr_storage own = {}, peer = {};
+    socklen_t size = sizeof own, peer_size = sizeof peer;
+    if (!getpeername(socket, reinterpret_cast<sockaddr *>(&peer), &peer_size) &&
+        !getsockname(socket, reinterpret_cast<sockaddr *>(&own), &size) && host_of(own) == address)
+      shutdown(socket, SHUT_RDWR);
+  }
+  if (all)
+    closedir(all);
 }
 }
 #endif
