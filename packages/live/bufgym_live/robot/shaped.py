@@ -48,6 +48,7 @@ class ShapedLink:
         self._speed = speed
         self._clock = clock
         self._began_s = clock()
+        self._begun = asyncio.Event()
         self._position = 0
         self._open = asyncio.Event()
         self._open.set()
@@ -65,9 +66,11 @@ class ShapedLink:
         return int(listening.getsockname()[1])
 
     def begin(self) -> None:
-        """Begin the trace now."""
+        """Begin the trace now, also for the bytes that are just crossing."""
         self._began_s = self._clock()
         self._position = 0
+        self._begun.set()
+        self._begun = asyncio.Event()
 
     def cut(self) -> None:
         """Break all connections and accept no new ones until ``mend``."""
@@ -109,6 +112,7 @@ class ShapedLink:
 
     async def _up(self, sender: socket.socket, receiver: socket.socket) -> None:
         """Forward to the receiver each piece once it has crossed; connections take turns."""
+        propagation_s = self._link.propagation_us / 1e6 / self._speed
         crossed: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue(_MOST_PIECES)
         delivery = asyncio.create_task(self._deliver(crossed, receiver))
         try:
@@ -117,10 +121,9 @@ class ShapedLink:
                 if not piece:
                     break
                 async with self._turn:
-                    crossed_s = self._crossed_s(len(piece), waited_s)
-                    await self._until(crossed_s)
+                    crossed_s = await self._cross(len(piece), waited_s)
                 self.carried_bytes += len(piece)
-                await crossed.put((crossed_s + self._link.propagation_us / 1e6, piece))
+                await crossed.put((crossed_s + propagation_s, piece))
             await crossed.join()
         finally:
             delivery.cancel()
@@ -129,7 +132,8 @@ class ShapedLink:
         """Deliver pieces a propagation delay after they have crossed."""
         while True:
             arrives_s, piece = await crossed.get()
-            await self._until(arrives_s)
+            while (rest_s := arrives_s - self._clock()) > 0:
+                await asyncio.sleep(rest_s)
             await asyncio.get_running_loop().sock_sendall(receiver, piece)
             crossed.task_done()
 
@@ -154,10 +158,18 @@ class ShapedLink:
         crossed_us = self._link.time_at(self._position)
         return float("inf") if crossed_us == FOREVER else crossed_us / 1e6
 
-    async def _until(self, time_s: float) -> None:
-        """Sleep until a link time; for ever if the link has stopped."""
+    async def _cross(self, size_bytes: int, waited_s: float) -> float:
+        """Return once these bytes have crossed, and the clock's time of that; never if the link has stopped.
+
+        If the trace begins meanwhile, they cross at its beginning.
+        """
+        time_s, begun = self._crossed_s(size_bytes, waited_s), self._begun
         while (rest_s := (time_s - self._now_s()) / self._speed) > 0:
-            await asyncio.sleep(min(rest_s, 1.0))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(min(rest_s, 1.0)):
+                    await begun.wait()
+                time_s, begun = self._crossed_s(size_bytes, 0.0), self._begun
+        return self._began_s + time_s / self._speed
 
 
 async def _piece(connection: socket.socket) -> tuple[float, bytes]:

@@ -22,10 +22,14 @@ from loop_cases import until
 from needs import needs
 from roscpp_cases import gone, run
 
+from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
+from bufgym.scenario import Episode
+from bufgym.sim import outcome
+from bufgym.sim import run as simulate
 from bufgym.traces import Trace
-from bufgym_live.robot import rclcpp, read_log, roscpp
+from bufgym_live.robot import rclcpp, read_log, replay, roscpp
 from bufgym_live.robot.ros2.names import parse
 from bufgym_live.robot.shaped import ShapedLink
 
@@ -37,8 +41,6 @@ PLACES: Final = (
 HERE: Final = Path(__file__).parent
 CAMERA: Final = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
 PAYLOAD: Final = 1448 / 1514  # Share of an Ethernet frame's bytes
-ROSCPP_QOI: Final = 136.5
-"""QoI of roscpp's queue under ``afr`` over the same fade (docs/guide/on-a-robot.md)."""
 WRONG: Final = {
     "topics:=/camera": "topics",
     "port:=0": "port",
@@ -134,8 +136,12 @@ def settled(log: Path, frames: int) -> bool:
     return events.count("put") == events.count("gone") + events.count("dropped") == frames
 
 
-async def test_over_the_fade_it_is_as_good_as_roscpp(installed: dict[str, str], tmp_path: Path) -> None:
-    """A parameter file, a namespace, a name and a remapping; 600 frames; SIGTERM ends it in order."""
+async def test_over_a_fade_it_is_better_than_a_queue_of_dds(installed: dict[str, str], tmp_path: Path) -> None:
+    """A parameter file, a namespace, a name and a remapping; 600 frames; SIGTERM ends it in order.
+
+    Over the link as the log measured it, so a busy machine is no difference, and DDS drops the oldest. How much gets
+    through has a wide margin: 4 and 5 % less than in the simulator at a load of 9 to 11 on 2 cores.
+    """
     rates = [(7.5, 3e6 * PAYLOAD), (5, 0.25e6 * PAYLOAD), (7.5, 3e6 * PAYLOAD)]
     fade, log = Trace.steps(rates), tmp_path / "camera-0.jsonl"
     async with receiving() as (_, port, came):
@@ -157,7 +163,14 @@ async def test_over_the_fade_it_is_as_good_as_roscpp(installed: dict[str, str], 
             await link.close()
     assert in_order(came) and parse(came[0].body)[0].type == "sensor_msgs/msg/CompressedImage"
     assert gone(log) == [one.seq for one in came]
-    assert qoi.exponential().information([one.x for one in came]) > 0.99 * ROSCPP_QOI
+    records = read_log(log)
+    ours, dds = replay(records).outcome, replay(records, policies.get("drop-oldest")).outcome
+    assert ours.qoi == pytest.approx(qoi.exponential().information([one.x for one in came]))
+    assert ours.qoi > dds.qoi and ours.longest_gap < dds.longest_gap
+    shaped = Episode(replay(records).episode.arrivals, Link(fade))
+    simulated = outcome(simulate(policies.get("afr"), [shaped], 15, qoi.exponential()), 0)
+    print("afr, dds, simulated:", *((one.delivered, one.qoi, one.longest_gap) for one in (ours, dds, simulated)))
+    assert ours.delivered > 0.7 * simulated.delivered
 
 
 @pytest.mark.parametrize("given", WRONG)

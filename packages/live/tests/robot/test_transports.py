@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import itertools
-import socket
 import subprocess
 import sys
 from typing import Any
@@ -19,7 +17,7 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Uplink, messages
 from bufgym.traces import Trace
-from bufgym_live.robot import PolicyQueue, replay, shaped
+from bufgym_live.robot import PolicyQueue, replay
 from bufgym_live.robot.bus_channel import BusChannel
 from bufgym_live.robot.channels import TRANSPORTS, WebSocketChannel
 from bufgym_live.robot.frames import DATA, GREETING, HEADER_BYTES, Frame, Room, header
@@ -87,28 +85,6 @@ async def test_what_the_systems_buffers_hide_is_lost() -> None:
     assert hidden < 0.9 * small
 
 
-@pytest.mark.parametrize(("back", "carried_bytes"), [(True, 10**6), (False, 4)])
-async def test_a_link_whose_messages_come_back(back: bool, carried_bytes: int) -> None:
-    """4 bytes go to who is called, 1 MB comes back. The link carries the one or the other."""
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(bytes(250_000) * len(await reader.readexactly(4)))
-        await writer.drain()
-        writer.close()
-
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    link = ShapedLink(Link(Trace.constant(2e7, duration_s=1)), server.sockets[0].getsockname(), back=back)
-    reader, writer = await asyncio.open_connection("127.0.0.1", await link.listen())
-    writer.write(b"send")
-    await reader.readexactly(10**6)
-    assert link.carried_bytes == carried_bytes
-    writer.close()
-    await writer.wait_closed()
-    await link.close()
-    server.close()
-    await server.wait_closed()
-
-
 async def test_nothing_is_compiled_while_the_episodes_time_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first decision of a process takes a second, which it must not cost: it is made before time runs."""
     done: list[str] = []
@@ -154,44 +130,6 @@ def test_the_table_and_orders_by_hand() -> None:
     # On link a the three differ by more than 1 % but for the last two, of which live one swaps with the first.
     runs = [one("afr", 5.0, 4.9), one("random", 4.0, 3.9), one("drop-oldest", 4.03, 4.95), one("afr", 1.0, 1.0, "b")]
     assert orders(runs) == (1, 2)
-
-
-# --- when a shaped link counts as idle: it carries 1 MB/s, and pieces have 10 kB -------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("now_s", "waited_s", "crossed_s"),
-    [
-        (0.06, 0.0, 0.02),  # more bytes lay there: the link was busy all the time, however late this program is
-        (0.06, 0.002, 0.02),  # an ack had to go round
-        (0.06, 0.04, 0.065),  # idle; what comes now counts from 5 ms ago
-        (0.5, 0.002, 0.41),  # stopped for half a second: it makes up for 0.1 s
-        (0.012, 0.04, 0.02),  # ahead of time
-    ],
-)
-def test_bytes_that_are_late(now_s: float, waited_s: float, crossed_s: float) -> None:
-    times = [0.0]
-    link = ShapedLink(Link(Trace.steps([(10, 1e6)])), ("127.0.0.1", 1), clock=lambda: times[0])
-    assert link._crossed_s(10_000, 0.0) == pytest.approx(0.01)
-    times[0] = now_s
-    assert link._crossed_s(10_000, waited_s) == pytest.approx(crossed_s)
-
-
-async def test_waiting_for_a_processor_is_not_waiting_for_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def waited_s() -> float:
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            ours.setblocking(False)
-            asyncio.get_running_loop().call_later(0.02, theirs.send, b"late")
-            waited, piece = await shaped._piece(ours)
-        assert piece == b"late"
-        return waited
-
-    monkeypatch.setattr(shaped, "_starved_s", lambda: 0.0)
-    assert await waited_s() > 0.01
-    stops = itertools.count()
-    monkeypatch.setattr(shaped, "_starved_s", lambda: 100.0 * next(stops))
-    assert await waited_s() == pytest.approx(1e-6)
 
 
 # What untrusted clients cannot take from a receiver: its memory, its sockets, its time.
