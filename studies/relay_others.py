@@ -1,6 +1,7 @@
 """The same messages through a relay, a NATS server and an MQTT broker: processor time a delivery, and memory.
 
 python -m studies.relay_others --robots 20 --viewers 5 --seconds 20
+python -m studies.relay_others --bytes 1000 --only relay
 
 Each robot sends pictures of 50 kB ten times a second, each viewer gets all of them. Clients share this process; only
 the server's own process is counted. Needs nats-server and mosquitto.
@@ -127,14 +128,17 @@ async def over_mqtt(viewers: int, heard: Callable[[], None]) -> AsyncIterator[tu
             one.loop_stop()
 
 
-async def measure(name: str, over: Any, robots: int, viewers: int, seconds: float) -> None:
-    count, data = 0, os.urandom(SIZE_BYTES)
+SERVERS: dict[str, Any] = {"relay": over_relay, "nats-server": over_nats, "mosquitto": over_mqtt}
+
+
+async def measure(name: str, robots: int, viewers: int, seconds: float, size_bytes: int) -> None:
+    count, data = 0, os.urandom(size_bytes)
 
     def heard() -> None:
         nonlocal count
         count += 1
 
-    async with over(viewers, heard) as (pid, publish):
+    async with SERVERS[name](viewers, heard) as (pid, publish):
 
         async def drive(k: int, seconds: float) -> None:
             async for _ in each(RATE_HZ, round(seconds * RATE_HZ), k / robots / RATE_HZ):
@@ -155,9 +159,11 @@ async def main() -> None:
     parser.add_argument("--robots", type=int, default=20)
     parser.add_argument("--viewers", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--bytes", dest="size_bytes", type=int, default=SIZE_BYTES)
+    parser.add_argument("--only", nargs="+", choices=SERVERS, default=list(SERVERS))
     options = vars(parser.parse_args())
-    for name, over in (("relay", over_relay), ("nats-server", over_nats), ("mosquitto", over_mqtt)):
-        await measure(name, over, **options)
+    for name in options.pop("only"):
+        await measure(name, **options)
 
 
 if __name__ == "__main__":

@@ -265,11 +265,20 @@ class Accepted(ServerConnection):
 
     async def send_frame(self, frame: bytes) -> None:
         """Send a whole frame, which was written for all its receivers."""
-        if self.protocol.state is not State.OPEN:
-            async with self.send_context():  # raises ConnectionClosed once the connection has ended
-                pass
+        await self.until_open()
         self.transport.write(frame)
         await self.drain()
+
+    async def until_open(self) -> None:
+        """Raise ConnectionClosed, once a connection that is not open has ended."""
+        if self.protocol.state is not State.OPEN:
+            async with self.send_context():
+                pass
+
+    @property
+    def takes_more(self) -> bool:
+        """Whether a frame could be written now, with none before it that has not left."""
+        return self.protocol.state is State.OPEN and not self.paused and not self.transport.is_closing()
 
     @property
     def _held_bytes(self) -> int:

@@ -249,9 +249,10 @@ class Connection:
         """A message that its queues decide on."""
         if is_stop(outgoing.message.topic):
             self._outbox.urgent[outgoing.message.topic] = outgoing
+            self._outbox.wake()
         else:
             subscription.offer(outgoing.message.topic, outgoing, outgoing.size_bytes)
-        self._outbox.wake()
+            self._outbox.offered()
 
     def _answer_waits(self) -> None:
         self._outbox.wake()

@@ -1,11 +1,12 @@
 """Messages to one client, the most urgent first.
 
 Stops go first, then the relay's answers, then no_drop messages while fewer than n_T are unacked, then messages from the
-queues.
+queues. A message that comes to an idle connection is sent at once, in its sender's turn.
 """
 
 import asyncio
 from collections import deque
+from collections.abc import Collection
 from typing import Final
 
 from websockets.exceptions import WebSocketException
@@ -14,19 +15,20 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.hub import Member
 from bufgym_live.relay.outgoing import Outgoing
-from bufgym_live.relay.subscriber import make_one, next_lane
+from bufgym_live.relay.subscriber import Lane, Subscription, make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
 MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed
 
 
 class Outbox:
-    """The only task that writes to a connection."""
+    """The only part that writes to a connection: its task, or ``offered`` while the task has nothing to do."""
 
     def __init__(self, caller: Caller, member: Member, form: str, received: int) -> None:
         """``form`` says how its messages are written; the client has no_drop messages up to ``received``."""
         self._hub, self._caller, self._socket = caller.hub, caller, caller.socket
-        self._awake = asyncio.Event()
+        self._awake, self._is_idle = asyncio.Event(), False
+        self._leaving: Lane | None = None  # the one with a message of which the system has not all
         self._member, self._form = member, form
         self._sent_number = received
         self._in_flight: deque[int] = deque()
@@ -37,6 +39,22 @@ class Outbox:
     def wake(self) -> None:
         """Look for something to send."""
         self._awake.set()
+
+    def offered(self) -> None:
+        """Look for what came into the queues: at once if nothing else waits, or have the task do it."""
+        # While the task waits and nobody has woken it, no stop, answer or no_drop message could go first.
+        if not (self._is_idle and not self._awake.is_set() and self._socket.takes_more and self._sent_at_once()):
+            self._awake.set()
+
+    def _sent_at_once(self) -> bool:
+        """Send the next message of the queues; return whether it has left and is the last."""
+        try:
+            lane = self._write_queued(self._member.subscriptions.values())
+        except Exception as error:  # must not end the sender's turn: it is the fault of this connection
+            self._socket.transport.abort()
+            asyncio.get_running_loop().call_exception_handler({"message": "a relay's outbox", "exception": error})
+            return True
+        return lane is not None and not lane.carried and not lane.ready
 
     def acked(self, number: int) -> None:
         """Note that the client has processed all no_drop messages up to this number."""
@@ -50,8 +68,10 @@ class Outbox:
         """Send messages one after the other."""
         try:
             while True:
+                self._is_idle = True
                 await self._awake.wait()
                 self._awake.clear()
+                self._is_idle = False
                 while await self.one():
                     pass
         except (WebSocketException, OSError):
@@ -62,6 +82,7 @@ class Outbox:
 
     async def one(self) -> bool:
         """Send the next message; return whether there was one."""
+        await self._left()
         while self.urgent:
             # Taken out before the wait: a newer stop that comes during it must go out, too.
             await self._send(self.urgent.pop(next(iter(self.urgent))))
@@ -71,16 +92,36 @@ class Outbox:
         if self._sent_number < member.session.numbered and await self._no_drop(member):
             return True
         subscriptions = list(member.subscriptions.values())
-        made, now_s = await make_one(subscriptions, self._hub.making), self._hub.clock()
+        made = await make_one(subscriptions, self._hub.making)
+        await self._socket.until_open()
+        if self._write_queued(subscriptions) is None:
+            return made
+        await self._left()
+        return True
+
+    def _write_queued(self, subscriptions: Collection[Subscription]) -> Lane | None:
+        """Write the next message of the queues; return its lane, ``carried`` until the system has all of it."""
+        now_s = self._hub.clock()
         lane = next_lane(subscriptions, now_s)
         item = None if lane is None else lane.take(now_s)
         if lane is None or item is None:
-            return made
+            return None
         if not self._hub.orders.is_over(item.message.message, self._hub.now_us()):
-            await self._send(item.message)
+            self._socket.transport.write(item.message.frame(self._form))
+            self._member.sent += 1
         # After the send: until then the policy counts these bytes as still to leave.
-        lane.gone()
-        return True
+        if self._socket.paused:
+            self._leaving = lane
+        else:
+            lane.gone()
+        return lane
+
+    async def _left(self) -> None:
+        """Wait until the system has all that was written."""
+        await self._socket.drain()
+        if self._leaving is not None:
+            self._leaving.gone()
+            self._leaving = None
 
     async def _no_drop(self, member: Member) -> bool:
         """Send the no_drop message that was fetched; have the next one fetched if the window has room for it."""

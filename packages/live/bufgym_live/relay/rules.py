@@ -80,6 +80,7 @@ class Permissions:
     def __init__(self, rules: Sequence[Rule], identity: Identity) -> None:
         self.rules = tuple(rule for rule in rules if means(rule, identity))
         self._answers: dict[tuple[Verb, str], bool] = {}
+        self._command_s: dict[str, float] = {}
 
     def allow(self, verb: Verb, topic: str) -> bool:
         """Whether a rule allows this on the topic."""
@@ -95,8 +96,14 @@ class Permissions:
     def command_s(self, topic: str) -> float:
         """Give the time for which a command on this topic may be executed, by the first rule that lets it be sent."""
         topic = right(topic)
-        found = (rule.command_s for rule in self.rules if rule.send and pattern(rule.topic).whole(topic))
-        return next(found, COMMAND_S)
+        answer = self._command_s.get(topic)
+        if answer is None:
+            found = (rule.command_s for rule in self.rules if rule.send and pattern(rule.topic).whole(topic))
+            answer = next(found, COMMAND_S)
+            if len(self._command_s) >= _REMEMBERED:
+                self._command_s.clear()
+            self._command_s[topic] = answer
+        return answer
 
     @property
     def receives(self) -> bool:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -128,7 +128,7 @@ async def make_one(subscriptions: Sequence[Subscription], turn: asyncio.Lock) ->
     return False
 
 
-def next_lane(subscriptions: Sequence[Subscription], now_s: float) -> Lane | None:
+def next_lane(subscriptions: Collection[Subscription], now_s: float) -> Lane | None:
     """Choose the lane that sends next; None if nothing waits."""
     ready = [(one.priority, lane) for one in subscriptions for lane in one.lanes if lane.ready]
     return max(ready, key=lambda each: each[0] * (now_s - each[1].served_s))[1] if ready else None

@@ -51,6 +51,16 @@ async def test_a_message_goes_to_each_subscriber_but_its_sender(corner: Corner) 
         assert await nothing(robot, viewer)
 
 
+async def test_an_idle_connection_takes_messages_of_one_turn_without_a_drop(corner: Corner) -> None:
+    """The rule keeps only the newest of those that wait; on an idle connection none waits."""
+    async with corner.client() as viewer:
+        topic = corner.topic("odom")
+        await viewer.subscribe(f"^{topic}$", policy="robofleet")
+        for text in (b"1", b"2", b"3"):
+            corner.hub.publish(None, Message(topic, text, "raw"))
+        assert [bytes((await viewer.next()).payload) for _ in range(3)] == [b"1", b"2", b"3"]
+
+
 async def test_the_last_message_of_a_latched_topic_comes_to_who_subscribes_later(
     corner: Corner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
