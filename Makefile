@@ -28,7 +28,7 @@ help:
 	@echo "make fuzz     set up if needed, then feed it broken files, command lines and random episodes"
 	@echo "make claims   set up if needed, then test every claim of the papers (DATA=folder of recordings)"
 	@echo "make docs     set up if needed, then build the site to build/site"
-	@echo "make gallery  set up if needed, then draw the films and the interactive page in docs/ again"
+	@echo "make gallery  set up if needed, then draw the films, the previews and the interactive page in docs/ again"
 	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
 	@echo "make dist     set up if needed, then build and check wheel and sdist in dist/"
 	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies"
@@ -70,6 +70,7 @@ docs: $(READY)
 
 gallery: $(READY)
 	$(BIN)/python -m website.films all --interactive docs/interactive.html
+	$(BIN)/python -m website.previews
 
 # Each draws its picture beside itself.
 tutorials: $(READY)

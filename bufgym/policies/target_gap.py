@@ -21,11 +21,17 @@ no exception. On a steady link, where g is known, the even spacing is made behin
 A message adds nothing if V is straight from its one neighbour to the other: V(a) + V(b) = V(a + b). A V that saturates
 is straight up to where it is flat.
 
-No target is set while the past does not predict the future. In bursts an empty queue would leave the link idle; one
-long pause counts as a burst for some seconds. Nor is there a target for queues of fewer than ``LEAST`` messages, before
-anything has been sent, or until the stream has run for as long as a full queue takes to be sent, a short queue's for
-``SHORT_RUN_US``. If the robot knows when the stream ends, a quarter of that long is enough, and T ends there. Then the
-smallest gap goes, and ``thinning`` says whether it goes with room too.
+The rule sets no target in four cases:
+
+- Messages come in bursts, where an empty queue would leave the link idle. One long pause counts as a burst for some
+  seconds.
+- The queue has fewer than ``LEAST`` places.
+- Nothing has been sent yet.
+- The stream is young: it has not yet run for as long as a full queue takes to be sent. If the robot knows when the
+  stream ends, a quarter of that time is enough, and T ends there. For a short queue a stream is young for
+  ``SHORT_RUN_US``, too.
+
+Without a target the smallest gap goes, and ``thinning`` says whether it goes with room too.
 
 A queue of up to ``SHORT_QUEUE`` messages holds too little to wait for a target. Its head gets a *last chance*:
 
