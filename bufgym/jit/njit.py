@@ -65,8 +65,8 @@ class _Kernel:
         """Types of arguments -> compiled code."""
         return self.whole.overloads
 
-    def __call__(self, *arguments: Any) -> Any:
-        return self.whole(*arguments)
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.whole(*arguments, **named)
 
     def __reduce__(self) -> Any:
         return kernel, (self.py_func,)

@@ -127,7 +127,7 @@ print(json.dumps([
     third(strided),
     corner(table, 1),
     outer(Numbers(np.array([7.0])), None, None),
-    outer(Numbers(np.array([7.0]), None, np.array([8.0])), 5, None),
+    outer(Numbers(np.array([7.0]), None, np.array([8.0])), several=None, few=5),
     directly(Numbers(np.array([9.0])), None, None),
     jit.entry_point_of(function)(2.0),
     applied(jit.with_address(real(real), function), 4.0),
