@@ -6,8 +6,9 @@ python -m studies.relay_soak --minutes 1 --stall 0   # kills alone
 Robots and viewers are spread over the relays. Each robot sends pictures of 20 kB twice a second. A viewer watches three
 robots, one at each relay. An operator at each relay sends commands to robots of all relays, two a second. Every ten
 seconds one relay of the last two is killed, and starts again at once; another stands in for it meanwhile. The first
-relay lives on, so that its memory can be watched. Every minute NATS is stopped (SIGSTOP) for ``--stall`` seconds. Needs
-nats-server. Prints a line for each promise, PASS or FAIL.
+relay lives on, so that its memory can be watched. Every minute NATS is stopped (SIGSTOP) for ``--stall`` seconds.
+Commands may be executed for a minute, longer than any break: with a shorter deadline some would rightly be withdrawn
+after their ack. Needs nats-server. Prints a line for each promise, PASS or FAIL.
 """
 
 import argparse
@@ -41,6 +42,7 @@ nats = true
 send = true
 receive = true
 topic = "/robots/.*"
+command_s = 60
 [nats]
 url = "nats://127.0.0.1:{nats}"
 name = "{name}"
