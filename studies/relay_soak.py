@@ -33,7 +33,7 @@ from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.sockets import free_port
 
-RELAYS, RATE_HZ, SIZE_BYTES, COMMAND_S = 3, 2.0, 20_000, 0.5
+RELAYS, RATE_HZ, SIZE_BYTES, COMMAND_S, DEADLINE_S = 3, 2.0, 20_000, 0.5, 60
 KILL_S, STALL_EVERY_S, SETTLES_S, SAMPLE_S = 10.0, 60.0, 8.0, 5.0
 MOST_GAP_S, MOST_GROWTH_MB = 2.0, 20.0
 SHARED = """
@@ -42,7 +42,6 @@ nats = true
 send = true
 receive = true
 topic = "/robots/.*"
-command_s = 60
 [nats]
 url = "nats://127.0.0.1:{nats}"
 name = "{name}"
@@ -64,6 +63,7 @@ class Soak:
 
     async def started(self, k: int) -> asyncio.subprocess.Process:
         config = relay_load.CONFIG.replace("port = 0", f'port = {self.ports[k]}\nfolder = "held"')
+        config = config.replace("send = true", f"send = true\ncommand_s = {DEADLINE_S}")
         name = f"relay-{k}"
         one, _ = await relay_load.served(config + SHARED.format(nats=self.nats_port, name=name), self.folder / name)
         return one

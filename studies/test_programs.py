@@ -46,6 +46,7 @@ ELSEWHERE = {
     "studies.tune": "studies/test_tune.py",
     "website.films": "website/test_gallery.py",
     "website.interfaces": "website/test_interfaces.py",
+    "website.previews": "website/test_previews.py",
     "website.returns": "it plays 100 episodes in each environment, and takes minutes",
     "website.row": "needs the folder of a suite's run",
     "website.shares": "needs the folder of a suite's run",

@@ -24,6 +24,7 @@ from bufgym.traces.poses import Poses, unit
 from bufgym_live.robot import PolicyQueue, replay, ros1
 from bufgym_live.robot.log import of, read_log
 from bufgym_live.robot.odometry import Odometry
+from bufgym_live.robot.ros1 import new_address
 from bufgym_live.robot.ros1.__main__ import main as command
 from bufgym_live.robot.ros1.connection import PolicyConnection
 
@@ -82,6 +83,7 @@ def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     sys.modules["rospy.impl.tcpros_pubsub"].QueuedConnection = list  # type: ignore[attr-defined]
     sys.modules["rospy"].topics = sys.modules["rospy.topics"]  # type: ignore[attr-defined]
+    monkeypatch.setattr(new_address, "watch", lambda: None)  # it asks rospy itself
     monkeypatch.setattr(sys, "argv", sys.argv)
     monkeypatch.setattr(sys, "path", list(sys.path))
     return sys.modules["rospy.topics"]

@@ -5,6 +5,7 @@ another network, until its nodes are started again. A node whose address is anno
 alone. The master must be reachable from the new address.
 """
 
+import functools
 import os
 import sys
 import threading
@@ -19,8 +20,9 @@ _LOOK_S: Final = 0.5  # Time between two looks at the address
 _PATIENCE_S: Final = 1.0  # Time for the master to answer
 
 
+@functools.cache
 def watch() -> None:
-    """Look at this machine's address from now on, in a thread that lasts as long as the process."""
+    """Once in a process: look at this machine's address from now on, in a thread that lasts as long as the process."""
     threading.Thread(target=_watch, name="bufgym: address", daemon=True).start()
 
 
