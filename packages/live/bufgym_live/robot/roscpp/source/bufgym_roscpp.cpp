@@ -3,8 +3,8 @@
 //   LD_PRELOAD=libbufgym_roscpp.so BUFGYM_POLICY=learned rosrun ...      (settings.h has all settings)
 //
 // It takes the place of functions that libroscpp exports: of ros::TransportSubscriberLink enqueueMessage,
-// startMessageWrite and onMessageWritten, and of ros::network::getHost. Calls to them go through vtable, PLT and GOT, so the library that is loaded
-// first has them. roscpp's class is the same from indigo to noetic (transport_subscriber_link.h of ros_comm at
+// startMessageWrite and onMessageWritten, and of ros::network::getHost. Calls to them go through vtable, PLT and GOT, so
+// the library that is loaded first has them. roscpp's class is the same from indigo to noetic (transport_subscriber_link.h of ros_comm at
 // indigo-devel, kinetic-devel, melodic-devel and noetic-devel); its Boost headers must be the robot's own.
 #include <algorithm>
 #include <atomic>
