@@ -141,8 +141,8 @@ def settled(log: Path, frames: int) -> bool:
 async def test_over_a_fade_it_is_better_than_a_queue_of_dds(installed: dict[str, str], tmp_path: Path) -> None:
     """A parameter file, a namespace, a name and a remapping; 600 frames; SIGTERM ends it in order.
 
-    It is as good as roscpp, which a machine at a load of 9 to 11 on 2 cores misses by a little. DDS drops the oldest; it
-    has the link that the log measured.
+    It is as good as roscpp, which a machine at a load of 9 to 11 on 2 cores misses by a little. DDS drops the
+    oldest; it has the link that the log measured.
     """
     rates = [(7.5, 3e6 * PAYLOAD), (5, 0.25e6 * PAYLOAD), (7.5, 3e6 * PAYLOAD)]
     fade, log = Trace.steps(rates), tmp_path / "camera-0.jsonl"
