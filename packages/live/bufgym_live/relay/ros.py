@@ -24,8 +24,8 @@ from bufgym_live.robot.ros2.republishing import HOLD_S, readers_found
 NODE: Final = "bufgym_robot"
 TWIST: Final = Published("/cmd_vel", "geometry_msgs/msg/Twist")
 """Topic on which a person drives the robot, if it is one of those that it receives."""
-Outlet = Callable[[bytes], None]
-"""Publishes a message in CDR here."""
+Outlet = Callable[[bytes], Callable[[], None]]
+"""Reads a message in CDR, and returns what publishes it here."""
 
 
 def resolved(name: str) -> str:
@@ -68,10 +68,12 @@ class _RosSource:
                 return
             try:
                 outlet = await self._outlet(Published(name, message.type))
-                # Only now: while ROS matched a new publisher, the deadline may have passed, or a stop have come.
+                publish = outlet(bytes(message.payload))
+                # Only now: while ROS matched a new publisher, the deadline may have passed, or a stop have come. The
+                # first message of a type takes long to read, too.
                 if why := robot.refusal(message):
                     raise BufgymError(why)
-                outlet(bytes(message.payload))
+                publish()
             except Exception as error:  # messages are untrusted, and ROS has its own error types
                 robot.client.note(f"{message.topic}: not published: {error}")
 
@@ -95,12 +97,12 @@ class _RosSource:
         """Publish a velocity as a Twist, zeros at a stop; refuse other commands, because ROS takes them on topics."""
         match command:
             case {"command": "stop"} if TWIST.name in self._receive:
-                (await self._outlet(TWIST))(b"\0\1\0\0" + bytes(48))
+                (await self._outlet(TWIST))(b"\0\1\0\0" + bytes(48))()
                 return
             case {"command": "drive", "linear": linear, "angular": angular} if TWIST.name in self._receive:
-                outlet = await self._outlet(TWIST)
+                publish = (await self._outlet(TWIST))(b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
                 if (linear, angular) == (0, 0) or not self._is_stopped():  # a stop may have come meanwhile
-                    outlet(b"\0\1\0\0" + struct.pack("<6d", linear, 0, 0, 0, 0, angular))
+                    publish()
                 return
         raise BufgymError(f"command {command!r}: this robot takes commands on topics of ROS: {self._receive}")
 
@@ -119,11 +121,11 @@ class Ros2(_RosSource):
                 known = functools.partial(here.count_subscribers, topic.name)
                 await readers_found(topic.name, publisher.get_subscription_count, known, until_s, robot.client.note)
 
-                def publish(payload: bytes) -> None:
+                def read(payload: bytes) -> Callable[[], None]:
                     deserialize_message(payload, topic.message_class)  # nodes would meet what is broken
-                    publisher.publish(payload)
+                    return functools.partial(publisher.publish, payload)
 
-                return publish
+                return read
 
             def subscribe(topic: Published) -> list[Any]:
                 def take(payload: bytes) -> None:
@@ -142,6 +144,7 @@ class Ros1(_RosSource):
     async def run(self, robot: Robot) -> None:
         with needs_rospy():
             import rospy
+        await asyncio.to_thread(ros_messages.load)  # for a second or two; a command would be late
         rospy.init_node(NODE, anonymous=True, disable_signals=True)
         until_s = time.monotonic() + HOLD_S
 
@@ -149,12 +152,12 @@ class Ros1(_RosSource):
             publisher = rospy.Publisher(topic.name, topic.message_class, queue_size=10)
             await readers_found(topic.name, publisher.get_num_connections, lambda: 0, until_s, robot.client.note)
 
-            def publish(payload: bytes) -> None:
+            def read(payload: bytes) -> Callable[[], None]:
                 sent = rospy.AnyMsg()
                 sent._buff = ros_messages.as_ros1(payload, topic.type)
-                publisher.publish(sent)
+                return functools.partial(publisher.publish, sent)
 
-            return publish
+            return read
 
         self._listen(robot, advertise)
         subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted(robot)]

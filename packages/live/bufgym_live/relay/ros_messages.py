@@ -15,6 +15,12 @@ def _types(encoding: str) -> Any:
     return typestore(encoding)
 
 
+def load() -> None:
+    """Load the types of both versions, which the first message would wait for."""
+    for encoding in ("cdr", "ros1"):
+        _types(encoding)
+
+
 def read(payload: bytes, type: str, encoding: str = "cdr") -> Any:
     """Decode a message; raise a BufgymError if it is not of this type."""
     try:

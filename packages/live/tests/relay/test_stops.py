@@ -19,6 +19,7 @@ from bufgym_live.relay.config import Rule
 from bufgym_live.relay.drive import STILL, Drive, Velocity
 from bufgym_live.relay.orders import Orders, moves
 from bufgym_live.relay.robot import Robot
+from bufgym_live.relay.ros import Ros1
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.wire import Message, RefusedError
 
@@ -202,6 +203,31 @@ async def test_a_goal_that_waited_on_a_link_is_refused_and_the_stop_comes_first(
             assert await one.goal("next") == ""
             await until("the next goal", lambda: one.program.names[-1] == "next")
             assert one.program.names == ["first", "stop", "next"]
+
+
+async def test_a_goal_whose_deadline_passes_while_it_is_read_is_not_published() -> None:
+    """The first message of a type is read for a second: a source of ROS asks for its deadline after that."""
+    robot, source = Robot("ws://127.0.0.1:1", "r", Ros1([], ["goal_pose"])), Ros1([], ["goal_pose"])
+    relay_s, published, said = [0.0], list[bytes](), list[str]()
+    robot.client.deadlines.clock = RelayClock(lambda: relay_s[0])
+    robot.client.deadlines.clock.heard(100_000_000, 0.0)
+    robot.client.note = said.append  # type: ignore[method-assign]
+    takes = dict[str, Any]()
+    robot.client.subscribe = lambda pattern, take: takes.update({pattern: take})  # type: ignore[method-assign]
+
+    async def advertise(topic: Any) -> Any:
+        def read(payload: bytes) -> Any:
+            relay_s[0] += 1.0
+            return lambda: published.append(payload)
+
+        return read
+
+    source._listen(robot, advertise)
+    for payload, until_us in ((b"in time", 101_500_000), (b"too late", 101_500_000), (b"in time", 103_500_000)):
+        goal = Message("/robots/r/to/goal_pose", payload, "cdr", "geometry_msgs/msg/PoseStamped", until_us=until_us)
+        await takes["^/robots/r/to/"](goal)
+    assert published == [b"in time", b"in time"]
+    assert said == ["/robots/r/to/goal_pose: not published: its deadline is over"]
 
 
 @compiled
