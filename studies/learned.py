@@ -49,8 +49,8 @@ the rule `gap-price`. It was made by `{command}`{seed}.
   (`bufgym.policies.guided.INPUTS`), whether there is room, log(L / 8), and which actions are the rule's: {seen} numbers
   in all. Where there is no odometry, x is the frame's index.
 - *Does* one of {actions} actions: accept, or drop the cheapest where there is no room; drop one of the candidates or
-  the head; do what `gap-price` does. It is asked at every arrival, and the highest output of those that are offered
-  decides.
+  the head; do what `gap-price` does. It is asked at every arrival, and takes the action with the highest output among
+  the actions that are offered.
 - *Keeps to the rule* on a link that has not varied for {even:.0f} seconds: there the rule alone is offered.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
 - *Sizes differ*: there it does what `gap-price` does. `bufgym bench --policies gap-price,learned --sizes jpeg` says
