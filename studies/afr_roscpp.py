@@ -89,6 +89,8 @@ class Reproduction(Figure):
     policies: Sequence[str] = ("stock", "drop-oldest", "afr", "min-motion-gap", "learned")
     seconds: float = 20.0
     stock_runs: int = 3
+    control: str = ""
+    """Congestion control of TCP in both namespaces; empty for the machine's."""
 
     RULES = {"round_trips_ms": several(at_least_0)}
 
@@ -127,6 +129,8 @@ class Reproduction(Figure):
     def _frames(self, built: Path, policy: str, rtt_ms: float, log: Path) -> list[int]:
         """The frames that reach the far end."""
         with (tunnel.opened if rtt_ms else kernel_link)() as through, tempfile.TemporaryDirectory() as home:
+            for end in (through.near, through.far):
+                end.set_congestion_control(self.control or tunnel.congestion_control())
             uri = f"http://{through.near.address}:11311"
             where = {**os.environ, "ROS_MASTER_URI": uri, "ROS_IP": through.near.address, "ROS_HOME": home}
             loaded = {"LD_PRELOAD": str(built), "BUFGYM_POLICY": policy, "BUFGYM_LOG": str(log)}

@@ -8,7 +8,8 @@ robots, one at each relay. An operator at each relay sends commands to robots of
 seconds one relay of the last two is killed, and starts again at once; another stands in for it meanwhile. The first
 relay lives on, so that its memory can be watched. Every minute NATS is stopped (SIGSTOP) for ``--stall`` seconds.
 Commands may be executed for a minute, longer than any break: with a shorter deadline some would rightly be withdrawn
-after their ack. Needs nats-server. Prints a line for each promise, PASS or FAIL.
+after their ack. The last ones are waited for as long. Needs nats-server. Prints a line for each promise, PASS or FAIL,
+and for each lost command when it was acked.
 """
 
 import argparse
@@ -56,8 +57,8 @@ class Soak:
         self.nats_port, *self.ports = (free_port("127.0.0.1") for _ in range(1 + RELAYS))
         self.urls = [",".join(f"ws://127.0.0.1:{p}" for p in self.ports[k:] + self.ports[:k]) for k in range(RELAYS)]
         self.relays: list[asyncio.subprocess.Process] = []
-        self.acked, self.came = set[tuple[int, int, int]](), Counter[tuple[int, int, int]]()
-        self.refused, self.ended = 0, 0
+        self.acked, self.came = dict[tuple[int, int, int], float](), Counter[tuple[int, int, int]]()
+        self.refused, self.ended, self.began_s = 0, 0, time.monotonic()
         self.gaps_s, self.last_s = [0.0] * viewers, [0.0] * viewers
         self.down_s, self.memory_mb = list[float](), list[float]()
 
@@ -109,7 +110,7 @@ class Soak:
                 to = (7 * number + k) % self.robots
                 try:
                     await operator.command(f"/robots/{to}/command", [k, number])
-                    self.acked.add((to, k, number))
+                    self.acked[(to, k, number)] = time.monotonic()
                 except BufgymError:
                     self.refused += 1
 
@@ -153,20 +154,31 @@ class Soak:
                             await self.kill(time.monotonic() + 60.0 * minutes)
                         for task in giving[:RELAYS]:
                             task.cancel()
-                        await asyncio.sleep(2 * SETTLES_S)
+                        until_s = time.monotonic() + DEADLINE_S
+                        while self.lost() and time.monotonic() < until_s:
+                            await asyncio.sleep(1.0)
+                        await asyncio.sleep(SETTLES_S)  # for what might come twice
             finally:
                 for one in self.relays:
                     with contextlib.suppress(ProcessLookupError):
                         one.kill()
                     await one.wait()
 
+    def lost(self) -> dict[tuple[int, int, int], float]:
+        """Commands that no robot has had, and when they were acked."""
+        return {one: at_s for one, at_s in self.acked.items() if one not in self.came}
+
     def report(self) -> None:
         """Print what was promised, and whether it was kept."""
-        lost, twice = sum(one not in self.came for one in self.acked), sum(n - 1 for n in self.came.values())
+        lost, twice = self.lost(), sum(n - 1 for n in self.came.values())
+        for (robot, operator, number), at_s in lost.items():
+            after_s = at_s - self.began_s
+            print(f"lost: command {number} of operator {operator} to robot {robot}, acked after {after_s:.0f} s")
         silent, growth_mb = max(self.gaps_s), max(self.memory_mb) - self.memory_mb[0]
         print(f"{len(self.down_s)} kills, a relay down for {max(self.down_s, default=0.0):.1f} s at most")
+        fates = f"{len(self.acked)} acked, {self.refused} refused, {len(lost)} lost, {twice} twice"
         lines = {
-            f"commands: {len(self.acked)} acked, {self.refused} refused, {lost} lost, {twice} twice": not lost + twice,
+            f"commands: {fates}": not lost and not twice,
             f"robots' programs that ended: {self.ended} of {self.robots}": not self.ended,
             f"longest time of a viewer without a picture: {silent:.1f} s": silent <= MOST_GAP_S,
             f"memory of the first relay: {self.memory_mb[0]:.0f} MB, grew by {growth_mb:.0f}": growth_mb

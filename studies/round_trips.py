@@ -2,10 +2,13 @@
 
     sudo python -m studies.round_trips                     # every round trip and rate, steady
     sudo python -m studies.round_trips --fade --rtt 50     # 24 Mbit/s, for a quarter of the time a twelfth of that
+    sudo python -m studies.round_trips --fade --rtt 50 --control bbr reno
 
 Frames of 230 kB come at 30 Hz into a queue of 15; V = 1 - 0.618^d over frames. Each run has two network namespaces of
 its own with tun devices between (``bufgym_live.robot.tunnel``); the bottleneck's buffer holds 200 kB. "system's
-buffers" is a sender as stock ROS has it: Drop Oldest, and a socket that takes whatever the system takes.
+buffers" is a sender as stock ROS has it: Drop Oldest, and a socket that takes whatever the system takes. An age is the
+time from the camera to the receiver. ``--control`` is the congestion control of TCP in both namespaces; by default they
+have the machine's.
 """
 
 import argparse
@@ -93,24 +96,31 @@ def link(mbit: float, seconds: float, fades: bool, round_trip_ms: float) -> Link
     return Link(trace, 0, round(round_trip_ms * 500))
 
 
-def cells(name: str, mbit: float, seconds: float, fades: bool, round_trip_ms: float) -> list[str]:
-    """Delivered, QoI and longest gap of a run, and of the simulator's."""
+def cells(name: str, mbit: float, seconds: float, fades: bool, round_trip_ms: float, control: str) -> list[str]:
+    """Delivered, QoI, longest gap and ages of a run, and the simulator's first three."""
     policy, play = SENDERS[name]
     times = np.arange(round(seconds * RATE_HZ)) * round(1e6 / RATE_HZ)
     episode = Episode(messages(times, SIZE_BYTES), link(mbit, seconds, fades, round_trip_ms))
     with tunnel.opened() as through:
+        for end in (through.near, through.far):
+            end.set_congestion_control(control)
         came = play(through, episode, policy)
     frames = [message.seq for message in came]
     x = episode.arrivals["x"][frames]
     simulated = outcome(run(policies.get(policy), [episode], CAPACITY, V), 0)
     gap = int(np.diff(frames).max(initial=0))
+    ages_s = np.array([message.received_ns for message in came]) / 1e9 - times[frames] / 1e6
     return [
-        f"{round_trip_ms:g}", f"{mbit:g}", name, policy, f"{len(frames)}", f"{V.information(x):.1f}", f"{gap}",
+        f"{round_trip_ms:g}", f"{mbit:g}", control, name, policy, f"{len(frames)}", f"{V.information(x):.1f}", f"{gap}",
+        f"{np.median(ages_s):.2f}", f"{ages_s.max(initial=0):.2f}",
         f"{simulated.delivered}", f"{simulated.qoi:.1f}", f"{simulated.longest_gap:g}",
     ]  # fmt: skip
 
 
-HEAD = ["RTT, ms", "Mbit/s", "sender", "policy", "delivered", "QoI", "longest gap", *(3 * ["simulated"])]
+HEAD = [
+    "RTT, ms", "Mbit/s", "TCP", "sender", "policy", "delivered", "QoI", "longest gap", "median age, s", "oldest, s",
+    *(3 * ["simulated"]),
+]  # fmt: skip
 
 
 def main() -> None:
@@ -121,6 +131,7 @@ def main() -> None:
         "--mbit", type=float, nargs="+", help="rates of the link, Mbit/s (default: 2 24 100; 24 fading)"
     )
     parser.add_argument("--senders", nargs="+", choices=SENDERS, default=["system's buffers", "tcp"])
+    parser.add_argument("--control", nargs="+", help="TCP's congestion control, as bbr reno (default: the machine's)")
     parser.add_argument("--seconds", type=float, help="length of the stream (default: 10; fading 20)")
     parser.add_argument("--fade", action="store_true", help="let the link fade")
     options = parser.parse_args()
@@ -128,9 +139,10 @@ def main() -> None:
     rows = []
     for mbit in options.mbit or ((24,) if options.fade else MBITS):
         for round_trip_ms in options.rtt:
-            for name in options.senders:
-                rows.append(cells(name, mbit, seconds, options.fade, round_trip_ms))
-                print("measured:", *rows[-1], flush=True)
+            for control in options.control or [tunnel.congestion_control()]:
+                for name in options.senders:
+                    rows.append(cells(name, mbit, seconds, options.fade, round_trip_ms, control))
+                    print("measured:", *rows[-1], flush=True)
     print(table(HEAD, rows))
 
 

@@ -22,8 +22,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bufgym.model.link import FOREVER, Link
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 ADDRESSES: Final = ("10.79.0.1", "10.79.0.2")
 """Of the near end, where the robot is, and of the far end. They exist inside the namespaces alone."""
 BUFFER_BYTES: Final = 200_000  # Size of the bottleneck's buffer, bytes of packets
+_CONTROL: Final = Path("/proc/sys/net/ipv4/tcp_congestion_control")
 _CLONE_NEWNET: Final = 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _PACKET_BYTES: Final = 2_000
@@ -65,6 +67,34 @@ class End:
         """Move this thread, and all that it starts, into the namespace."""
         if self.namespace is not None:
             _call("setns", self.namespace, _CLONE_NEWNET)
+
+    def set_congestion_control(self, name: str) -> None:
+        """Have TCP connections of this namespace use ``name`` from now on; all others of the machine keep theirs.
+
+        Raises:
+            BufgymError: the system has no such one.
+        """
+        if self.namespace is None:
+            raise BufgymError("congestion control: can be set in a namespace only, not for the whole machine")
+
+        def write() -> None:
+            self.enter()
+            with suppress(OSError):
+                _CONTROL.write_text(name)
+            found.append(_CONTROL.read_text().strip())
+
+        found = list[str]()
+        thread = threading.Thread(target=write)  # which ends in the namespace
+        thread.start()
+        thread.join()
+        if found != [name]:
+            known = _CONTROL.with_name("tcp_available_congestion_control").read_text().split()
+            raise BufgymError(f"congestion control {name!r}: must be one of {', '.join(known)}")
+
+
+def congestion_control() -> str:
+    """The congestion control that this machine's TCP uses."""
+    return _CONTROL.read_text().strip()
 
 
 HERE: Final = End("127.0.0.1")

@@ -9,6 +9,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import PolicyQueue, far, sockets, tunnel
 from bufgym_live.robot.frames import ACK, Frame
 from bufgym_live.robot.path_window import PathWindow
@@ -62,6 +64,43 @@ def test_a_short_path_holds_one_message(round_trip_s: float, messages_: int) -> 
         window.sends(number, 0.0)
         window.acked(number, 230_000, 0.0767 * (number + 1))
     assert window.messages == messages_
+
+
+# --- congestion control ----------------------------------------------------------------------------------------------
+
+
+def congestion_control(of: tunnel.End) -> str:
+    """That of a new socket at this end."""
+
+    def look() -> None:
+        of.enter()
+        with socket.socket() as one:
+            found.append(one.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16))
+
+    found = list[bytes]()
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    return found[0].rstrip(b"\0").decode()
+
+
+@in_namespaces
+def test_congestion_control_of_one_end_alone() -> None:
+    """Each Linux has Reno. The other end and the machine keep theirs."""
+    machine = congestion_control(tunnel.HERE)
+    with tunnel.opened() as through:
+        before = congestion_control(through.far)
+        through.near.set_congestion_control("reno")
+        assert congestion_control(through.near) == "reno"
+        assert (congestion_control(through.far), congestion_control(tunnel.HERE)) == (before, machine)
+        with pytest.raises(BufgymError, match=r"control 'nonsense': must be one of .*reno"):
+            through.near.set_congestion_control("nonsense")
+        assert congestion_control(through.near) == "reno"
+
+
+def test_congestion_control_of_the_whole_machine_is_left_alone() -> None:
+    with pytest.raises(BufgymError, match="in a namespace only"):
+        tunnel.HERE.set_congestion_control("reno")
 
 
 # --- when the next message goes --------------------------------------------------------------------------------------
