@@ -35,6 +35,7 @@ WHEELS = (
     *("ros-ament-package", "ros-ament-cmake-ros==0.12.0", "ros-ament-cmake==2.5.4"),
     *(f"ros-ament-cmake-{part}==2.5.4" for part in AMENT),
     *("empy<4", "catkin-pkg", "setuptools<80", "wheel", "osrf-pycommon", "argcomplete", "packaging", "psutil"),
+    "colcon-common-extensions",
 )
 """Jazzy's. The names ros-jazzy-ament-* are empty packages."""
 TAGS = {

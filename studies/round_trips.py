@@ -29,6 +29,7 @@ from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace
+from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import far, tunnel
 from bufgym_live.robot.receiver import Received
 from website.markdown import table
@@ -141,8 +142,12 @@ def main() -> None:
         for round_trip_ms in options.rtt:
             for control in options.control or [tunnel.congestion_control()]:
                 for name in options.senders:
-                    rows.append(cells(name, mbit, seconds, options.fade, round_trip_ms, control))
-                    print("measured:", *rows[-1], flush=True)
+                    try:
+                        rows.append(cells(name, mbit, seconds, options.fade, round_trip_ms, control))
+                    except BufgymError as error:  # as of a program that is not here
+                        print(f"left out: {name}: {error}", flush=True)
+                    else:
+                        print("measured:", *rows[-1], flush=True)
     print(table(HEAD, rows))
 
 

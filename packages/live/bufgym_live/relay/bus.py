@@ -61,7 +61,7 @@ def options(settings: Nats) -> dict[str, Any]:
 
 
 class Bus:
-    """One connection, from its beginning to its first fault."""
+    """One connection to a NATS server, from its beginning to its first fault."""
 
     def __init__(self, settings: Nats, limits: StoreLimits, note: Callable[[str], None], most: int) -> None:
         """``note`` is told of faults that leave the connection as it is; ``most`` as the last connection left it."""
@@ -224,7 +224,7 @@ class Bus:
         return True
 
     async def next(self) -> Any:
-        """Wait for the next no_drop message of another relay, or of this one."""
+        """Wait for the next no_drop message in the stream, of this relay or another."""
         while True:
             with contextlib.suppress(TimeoutError):  # there was none
                 return (await self._place.fetch(1, timeout=ASK_S))[0]

@@ -185,6 +185,32 @@ async def test_wrong_parameters_are_one_line_and_an_exit_code(given: str, instal
     assert line.startswith("bufgym_sender: error: ") and WRONG[given] in line and node.returncode == 2
 
 
+async def test_built_by_colcon(where: dict[str, str], tmp_path: Path) -> None:
+    """In a workspace, and sourced as its setup.bash says; the node runs from there and sends."""
+    if shutil.which("colcon", path=where.get("PATH")) is None:
+        pytest.skip(needs("rclcpp", "no colcon"))
+    rclcpp.write(tmp_path / "src" / "bufgym_sender", roscpp.find("afr"))
+    built = await asyncio.to_thread(
+        subprocess.run,
+        ("colcon", "--log-base", "log", "build", "--packages-select", "bufgym_sender"),
+        env=where,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0 and "1 package finished" in built.stdout, built.stdout + built.stderr
+    program = tmp_path / "install" / "bufgym_sender" / "lib" / "bufgym_sender" / "sender"
+    async with receiving() as (_, port, came):
+        given = f"source install/setup.bash && exec {program} --ros-args -p topics:=\"['/camera']\" -p port:={port}"
+        async with started(where, "bash", "-c", f"cd {tmp_path} && {given} -p policy:=afr") as node:
+            async with started(*camera(where, 30)):
+                await until(lambda: len(came) >= 10)
+            node.send_signal(signal.SIGTERM)
+            assert await asyncio.wait_for(node.wait(), 20) == 0
+    assert in_order(came)
+
+
 @pytest.fixture
 def launch(installed: dict[str, str]) -> tuple[str, ...]:
     """The command that launches the node."""
