@@ -1,4 +1,4 @@
-"""Files and lines of each row of ARCHITECTURE's table "Where to add", which the tests add to a copy of the sources."""
+"""Files and lines of each row of the table of docs/where-to-add.md, which the tests add to a copy of the sources."""
 
 import os
 import shutil

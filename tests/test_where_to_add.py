@@ -1,4 +1,4 @@
-"""ARCHITECTURE's table "Where to add", tried: in a copy, each row's thing is added where the row says, and used.
+"""The table of docs/where-to-add.md, tried: in a copy, each row's thing is added where the row says, and used.
 
 One process of plain Python uses them all. What is tried is where lines go, and how few they are.
 """
@@ -33,7 +33,7 @@ ELSEWHERE = {"a learner": "test_a_new_learner_is_a_class_and_its_settings"}
 
 
 def test_each_row_of_the_table_is_tried() -> None:
-    text = (REPO / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    text = (REPO / "docs" / "where-to-add.md").read_text(encoding="utf-8")
     table = text.partition("| new | goes to |\n|---|---|\n")[2].partition("\n\n")[0]
     assert set(re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)) == {*ROWS, *ELSEWHERE}
 
