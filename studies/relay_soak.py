@@ -43,6 +43,7 @@ nats = true
 send = true
 receive = true
 topic = "/robots/.*"
+command_s = {deadline_s}
 [nats]
 url = "nats://127.0.0.1:{nats}"
 name = "{name}"
@@ -58,7 +59,7 @@ class Soak:
         self.urls = [",".join(f"ws://127.0.0.1:{p}" for p in self.ports[k:] + self.ports[:k]) for k in range(RELAYS)]
         self.relays: list[asyncio.subprocess.Process] = []
         self.acked, self.came = dict[tuple[int, int, int], float](), Counter[tuple[int, int, int]]()
-        self.refused, self.ended, self.began_s = 0, 0, time.monotonic()
+        self.refused, self.ended, self.began_s = set[tuple[int, int, int]](), 0, time.monotonic()
         self.gaps_s, self.last_s = [0.0] * viewers, [0.0] * viewers
         self.down_s, self.memory_mb = list[float](), list[float]()
 
@@ -66,7 +67,9 @@ class Soak:
         config = relay_load.CONFIG.replace("port = 0", f'port = {self.ports[k]}\nfolder = "held"')
         config = config.replace("send = true", f"send = true\ncommand_s = {DEADLINE_S}")
         name = f"relay-{k}"
-        one, _ = await relay_load.served(config + SHARED.format(nats=self.nats_port, name=name), self.folder / name)
+        one, _ = await relay_load.served(
+            config + SHARED.format(nats=self.nats_port, name=name, deadline_s=DEADLINE_S), self.folder / name
+        )
         return one
 
     async def drive(self, k: int) -> None:
@@ -112,7 +115,7 @@ class Soak:
                     await operator.command(f"/robots/{to}/command", [k, number])
                     self.acked[(to, k, number)] = time.monotonic()
                 except BufgymError:
-                    self.refused += 1
+                    self.refused.add((to, k, number))
 
     async def kill(self, until_s: float) -> None:
         for k in itertools.cycle(range(1, RELAYS)):
@@ -176,9 +179,11 @@ class Soak:
             print(f"lost: command {number} of operator {operator} to robot {robot}, acked after {after_s:.0f} s")
         silent, growth_mb = max(self.gaps_s), max(self.memory_mb) - self.memory_mb[0]
         print(f"{len(self.down_s)} kills, a relay down for {max(self.down_s, default=0.0):.1f} s at most")
-        fates = f"{len(self.acked)} acked, {self.refused} refused, {len(lost)} lost, {twice} twice"
+        fates = f"{len(self.acked)} acked, {len(self.refused)} refused, {len(lost)} lost, {twice} twice"
+        executed = self.refused & self.came.keys()
         lines = {
             f"commands: {fates}": not lost and not twice,
+            f"refused commands that were executed: {len(executed)}": not executed,
             f"robots' programs that ended: {self.ended} of {self.robots}": not self.ended,
             f"longest time of a viewer without a picture: {silent:.1f} s": silent <= MOST_GAP_S,
             f"memory of the first relay: {self.memory_mb[0]:.0f} MB, grew by {growth_mb:.0f}": growth_mb
