@@ -58,14 +58,14 @@ class Side:
 processes: list[subprocess.Popen[str]] = []
 
 
-def start(domain: int, *words: str) -> str:
-    """Start a command of the relay in its domain; its first line."""
+def start(domain: int, *words: str, lines: int = 1) -> str:
+    """Start a command of the relay in its domain; the last of its first ``lines`` lines."""
     place = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
     command = [sys.executable, "-u", "-m", "bufgym", "ros2", *words]
     processes.append(subprocess.Popen(command, env=place, stdout=subprocess.PIPE, text=True))
     stdout = processes[-1].stdout
     assert stdout is not None
-    return stdout.readline().strip()
+    return [stdout.readline().strip() for _ in range(lines)][-1]
 
 
 def main(folder: str) -> None:
@@ -85,7 +85,8 @@ def main(folder: str) -> None:
         back = start(ROBOT, "receive", "--port", "0").rpartition(" ")[2]
         log = ["--policies", "fifo", "--log", str(Path(folder, "log.mcap"))]
         line = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
-        line_back = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back)
+        commands_toml = f"{folder}/commands.toml"
+        line_back = start(BASE, "send", "--config", commands_toml, "--to", back, lines=2)  # the first: it is connected
         own = Publisher(robot.node, String, "own/echo", to=("127.0.0.1", int(there.rpartition(":")[2])))
         came = base.came | robot.came
 
