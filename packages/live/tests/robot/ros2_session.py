@@ -59,13 +59,13 @@ processes: list[subprocess.Popen[str]] = []
 
 
 def start(domain: int, *words: str, lines: int = 1) -> str:
-    """Start a command of the relay in its domain; the last of its first ``lines`` lines."""
+    """Start a command of the relay in its domain; its first lines."""
     place = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
     command = [sys.executable, "-u", "-m", "bufgym", "ros2", *words]
     processes.append(subprocess.Popen(command, env=place, stdout=subprocess.PIPE, text=True))
     stdout = processes[-1].stdout
     assert stdout is not None
-    return [stdout.readline().strip() for _ in range(lines)][-1]
+    return "\n".join(stdout.readline().strip() for _ in range(lines))
 
 
 def main(folder: str) -> None:
@@ -84,9 +84,8 @@ def main(folder: str) -> None:
         there = start(BASE, "receive", "--port", "0").rpartition(" ")[2]
         back = start(ROBOT, "receive", "--port", "0").rpartition(" ")[2]
         log = ["--policies", "fifo", "--log", str(Path(folder, "log.mcap"))]
-        line = start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
-        commands_toml = f"{folder}/commands.toml"
-        line_back = start(BASE, "send", "--config", commands_toml, "--to", back, lines=2)  # the first: it is connected
+        start(ROBOT, "send", "--config", f"{folder}/client.toml", "--to", there, "--odom", "odom", *log)
+        said = start(BASE, "send", "--config", f"{folder}/commands.toml", "--to", back, lines=2).split("\n")
         own = Publisher(robot.node, String, "own/echo", to=("127.0.0.1", int(there.rpartition(":")[2])))
         came = base.came | robot.came
 
@@ -122,7 +121,12 @@ def main(folder: str) -> None:
         spin("the last picture", lambda: last("camera") == 99, 2.0, must=False)
         own.destroy(1.0)
         quality = base.node.get_publishers_info_by_topic("/camera")[0]
-        seen = {"came": came, "lines": [line, line_back], "by": quality.node_name, "faults": list(own.sender.faults)}
+        seen = {
+            "came": came,
+            "said": sorted(line.replace(back, "BACK") for line in said),
+            "by": quality.node_name,
+            "faults": list(own.sender.faults),
+        }
         seen["best_effort"] = quality.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         print(json.dumps(seen), flush=True)
         for process in processes:
