@@ -101,9 +101,9 @@ def test_workers_load_them_too_and_the_folder_knows_their_version(module: str, c
     shown(words, capsys)
     found = read_rows(Path("kept/rows.csv"))
     by_policy = {name: [row["qoi"] for row in found if row["policy"] == name] for name in ("newest", "drop-oldest")}
-    assert by_policy["newest"] == by_policy["drop-oldest"] and len(found) == 9
+    assert by_policy["newest"] == by_policy["drop-oldest"] and len(found) == 12  # 3 scenarios; a sweep runs AFR too
     held = json.loads(Path("kept/manifest.json").read_text())
-    assert held["policies"] == ["own", "newest", "drop-oldest"] and len(held["sources"]) == 2
+    assert held["policies"] == ["own", "newest", "drop-oldest", "afr"] and len(held["sources"]) == 2
     assert f"--policies own.safetensors,{module}:newest" in held["command"]
     shown(words, capsys)  # the same again
     with Path(f"{module}.py").open("a") as file:
