@@ -27,8 +27,8 @@ from website.picture import fading, play
 
 Frames = Iterator[NDArray[np.uint8]]
 
-FRAME_MS, LAST_MS = 140, 2500
-"""How long each image is shown, and the last one."""
+FRAME_MS, WHOLE_MS = 140, 2500
+"""How long each image is shown, and the one with the whole story."""
 MAX_BYTES = 300_000
 """Of a film."""
 _COLOURS = 48
@@ -51,15 +51,19 @@ class Film(NamedTuple):
 
 
 def write_film(name: str, folder: Path) -> Path:
-    """Write the film to ``folder/name.webp`` and return that path; BufgymError for an unknown name."""
+    """Write the film to ``folder/name.webp`` and return that path; BufgymError for an unknown name.
+
+    It begins with the end, which tells the whole story where a film does not move, as in print.
+    """
     if name not in FILMS:
         raise BufgymError(f"unknown film {name!r}; known: {', '.join(FILMS)}")
-    pictures = [Image.fromarray(frame) for frame in FILMS[name].frames()]
-    palette = _palette(pictures)
+    *pictures, end = (Image.fromarray(frame) for frame in FILMS[name].frames())
+    palette = _palette([*pictures, end])
+    pictures.insert(0, end)
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE).convert("RGB") for picture in pictures]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.webp"
-    durations = [FRAME_MS] * (len(pictures) - 1) + [LAST_MS]
+    durations = [WHOLE_MS] + [FRAME_MS] * (len(pictures) - 1)
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, lossless=True, method=4
     )
