@@ -12,6 +12,7 @@ from typing import Any
 
 import bufgym
 from bufgym import scenario
+from bufgym.cli.listing import SYMBOLS
 from bufgym.model.observe import (
     CANDIDATE_FIELDS,
     FIELDS,
@@ -69,10 +70,7 @@ INTERFACES = """\
 
 *Above the default, below `actions="slots"`. Made by `python -m website.interfaces`*"""
 
-RATIOS = """\
-s is the number of messages queued, e the even spacing (x_new - x_dequeued) / (L + 1), r the link's rate over 2 s, and p
-the time between arrivals."""
-
+RATIOS = f"{SYMBOLS}."
 
 RETURN = """\
 Mean return with `reward_scale="episode"`, the `ep_rew_mean` that a learner's curve is compared with, and steps of an

@@ -91,11 +91,23 @@ def _list_rewards() -> str:
     return _in_parts({title: [(t.name, t.unit, t.meaning) for t in terms] for title, terms in parts.items()})
 
 
-def _list_observations() -> str:
-    from bufgym.model.observe import FIELDS, ON_BOARD_FIELDS, ON_BOARD_SLOT_FIELDS, OWN_FIELDS, TOPIC_FIELDS
+SYMBOLS = (
+    "s is the number of messages queued, e the even spacing (x_new - x_dequeued) / (L + 1), "
+    "r the link's rate over 2 s, and p the time between arrivals"
+)
+"""Of the fields of candidates."""
 
-    named = (*ON_BOARD_FIELDS, *ON_BOARD_SLOT_FIELDS, *OWN_FIELDS.values())
-    parts = {"": FIELDS, _SEVERAL: TOPIC_FIELDS, "where `fields` names it": named}
+
+def _list_observations() -> str:
+    from bufgym.model import observe
+
+    named = (*observe.ON_BOARD_FIELDS, *observe.ON_BOARD_SLOT_FIELDS, *observe.OWN_FIELDS.values())
+    parts = {
+        SYMBOLS: (*observe.CANDIDATE_FIELDS, *observe.QUEUE_FIELDS),
+        "in place of these, where actions are slots": observe.FIELDS,
+        _SEVERAL: observe.TOPIC_FIELDS,
+        "where `fields` names it": named,
+    }
     return _in_parts({title: [(f.name, f.per, f.group, f.unit, f.meaning) for f in parts[title]] for title in parts})
 
 
