@@ -33,6 +33,7 @@ _RETRY_S: Final = 1.0
 _MINUTE_S: Final = 60.0
 _SLOW_SHARE: Final = 0.25  # of late_s, beyond which fewer messages are taken at a time
 _MOST_RELAYS: Final = 1_000
+_MOST_DOUBTFUL: Final = 10_000
 
 
 class Delays:
@@ -65,6 +66,8 @@ class Peers:
         self._bus: Bus | None = None
         self._known: set[str] = set()
         self._delays: defaultdict[str, Delays] = defaultdict(Delays)
+        self._doubtful = dict[str, None]()
+        """Ids of the messages of which NATS has not said whether it has them, in order."""
         self._awake = asyncio.Event()
         self._tasks = Tasks()
 
@@ -202,18 +205,27 @@ class Peers:
     async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
         """Give a no_drop message to the other relays.
 
-        Return whether they may have it, None if NATS does not say whether it has it. Without NATS, they have not.
+        Return whether they may have it, None if NATS does not say whether it has it. Without NATS, they have not, but
+        for what NATS was asked to take before it went away: it may have it, so to refuse it now could be wrong.
 
         Raises RefusedError: NATS does not take it.
         """
-        if self._bus is None or not self._goes("receive", message.topic):
+        if not self._goes("receive", message.topic):
             return False
         frame = wire.encode(_undated(message))
         origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
         id = hashlib.blake2b(origin + frame, digest_size=16).hexdigest()  # the same when it is sent again
+        if self._bus is None:
+            return None if id in self._doubtful else False
         put_us = str(time.time_ns() // 1000)
         headers = {"Nats-Msg-Id": id, "Relay": self._settings.name, "Put": put_us, **self._left(message)}
-        return await self._bus.hold(message.topic, frame, headers) or None
+        if not await self._bus.hold(message.topic, frame, headers):
+            self._doubtful[id] = None
+            if len(self._doubtful) > _MOST_DOUBTFUL:
+                del self._doubtful[next(iter(self._doubtful))]
+            return None
+        self._doubtful.pop(id, None)
+        return True
 
     async def _take_all(self, bus: Bus) -> None:
         while True:

@@ -125,7 +125,11 @@ async def test_a_relay_that_is_gone_for_good_is_forgotten(tmp_path: Path) -> Non
 
 
 async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """NATS stands still: the sender's connection ends, unanswered. It comes again and sends the same again."""
+    """NATS stands still: the sender's connection ends, unanswered. It comes again and sends the same again.
+
+    While the relay has given NATS up, it does not refuse that command: NATS takes it later. Another's, which NATS was
+    never asked to take, it refuses.
+    """
     monkeypatch.setattr("bufgym_live.relay.bus.ASK_S", 60.0)  # nothing but the command finds out
     port, command = free_port("127.0.0.1"), "/robots/a/command"
     async with (
@@ -140,6 +144,13 @@ async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monk
             await operator.command(1, command, stamp_us=1)
             with pytest.raises(Exception, match="NATS does not answer"):
                 await operator.next()
+        await alone(a)
+        async with client(a.port, session="operator") as operator, client(a.port, session="another") as another:
+            await operator.command(1, command, stamp_us=1)
+            with pytest.raises(Exception, match="NATS does not answer"):
+                await operator.next()
+            await another.command(1, command, stamp_us=1)
+            assert (await another.next())["code"] == "no_receiver"
         server.send_signal(signal.SIGCONT)
         await connected(a, b)
         async with client(a.port, session="operator") as operator:
