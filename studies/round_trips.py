@@ -8,7 +8,7 @@ Frames of 230 kB come at 30 Hz into a queue of 15; V = 1 - 0.618^d over frames. 
 its own with tun devices between (``bufgym_live.robot.tunnel``); the bottleneck's buffer holds 200 kB. "system's
 buffers" is a sender as stock ROS has it: Drop Oldest, and a socket that takes whatever the system takes. An age is the
 time from the camera to the receiver. ``--control`` is the congestion control of TCP in both namespaces; by default they
-have the machine's.
+have the machine's. A sender that cannot run here is left out, and the exit code is 1.
 """
 
 import argparse
@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--fade", action="store_true", help="let the link fade")
     options = parser.parse_args()
     seconds = options.seconds or (20.0 if options.fade else 10.0)
-    rows = []
+    rows, left_out = [], 0
     for mbit in options.mbit or ((24,) if options.fade else MBITS):
         for round_trip_ms in options.rtt:
             for control in options.control or [tunnel.congestion_control()]:
@@ -145,10 +145,13 @@ def main() -> None:
                     try:
                         rows.append(cells(name, mbit, seconds, options.fade, round_trip_ms, control))
                     except BufgymError as error:  # as of a program that is not here
+                        left_out += 1
                         print(f"left out: {name}: {error}", flush=True)
                     else:
                         print("measured:", *rows[-1], flush=True)
     print(table(HEAD, rows))
+    if left_out:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

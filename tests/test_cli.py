@@ -35,7 +35,7 @@ def trace(tmp_path: Path) -> str:
 def test_list_names_everything_there_is(capsys: Capsys) -> None:
     text = shown(["list"], capsys)
     names = [*policies.names(), *traces.shipped(), *LISTS, *shipped_calls().values()]
-    names += ["bufgym/Uplink-v0", "lte", "retained", "every=3"]
+    names += ["bufgym/Uplink-v0", "lte", "retained", "service_ratio", "every=3"]
     tables = (observe.CANDIDATE_FIELDS, observe.QUEUE_FIELDS, observe.FIELDS, observe.TOPIC_FIELDS)
     names += [field.name for fields in (*tables, observe.ON_BOARD_FIELDS) for field in fields]
     assert not [name for name in names if name not in text]

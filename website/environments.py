@@ -70,8 +70,6 @@ INTERFACES = """\
 
 *Above the default, below `actions="slots"`. Made by `python -m website.interfaces`*"""
 
-RATIOS = f"{SYMBOLS}."
-
 RETURN = """\
 Mean return with `reward_scale="episode"`, the `ep_rew_mean` that a learner's curve is compared with, and steps of an
 episode: 100 episodes with the default arguments, by `python -m website.returns`."""
@@ -134,7 +132,7 @@ def page(id: str) -> str:
     else:
         lines += ["## Action", INTERFACES, code(parts["Action"])]
         lines += ["## Observation", code(parts["Observation"])]
-        lines += [RATIOS, _fields((*CANDIDATE_FIELDS, *QUEUE_FIELDS))]
+        lines += [f"{SYMBOLS}.", _fields((*CANDIDATE_FIELDS, *QUEUE_FIELDS))]
     lines += ["## Reward", code(parts["Reward"]), _rewards(REWARD_TERMS + more)]
     lines += ["### Returns of rules", RETURN, _returns(id)]
     if one_queue:

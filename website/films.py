@@ -57,9 +57,9 @@ def write_film(name: str, folder: Path) -> Path:
     """
     if name not in FILMS:
         raise BufgymError(f"unknown film {name!r}; known: {', '.join(FILMS)}")
-    *pictures, end = (Image.fromarray(frame) for frame in FILMS[name].frames())
-    palette = _palette([*pictures, end])
-    pictures.insert(0, end)
+    pictures = [Image.fromarray(frame) for frame in FILMS[name].frames()]
+    palette = _palette(pictures)
+    pictures.insert(0, pictures.pop())
     pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE).convert("RGB") for picture in pictures]
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.webp"

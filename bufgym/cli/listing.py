@@ -95,7 +95,7 @@ SYMBOLS = (
     "s is the number of messages queued, e the even spacing (x_new - x_dequeued) / (L + 1), "
     "r the link's rate over 2 s, and p the time between arrivals"
 )
-"""Of the fields of candidates."""
+"""What the letters in the formulas of candidates' fields mean."""
 
 
 def _list_observations() -> str:
@@ -115,7 +115,7 @@ _SEVERAL = "with several topics besides"
 
 
 def _in_parts(parts: Mapping[str, Sequence[Sequence[str]]]) -> str:
-    """Print each part under its title in shared columns, first the rows that every environment has."""
+    """Print each part under its title, if it has one, in shared columns."""
     lines = columns([row for rows in parts.values() for row in rows]).split("\n")
     text: list[str] = []
     for title, rows in parts.items():

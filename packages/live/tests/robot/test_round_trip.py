@@ -98,6 +98,13 @@ def test_congestion_control_of_one_end_alone() -> None:
         assert congestion_control(through.near) == "reno"
 
 
+@in_namespaces
+def test_a_table_of_round_trips_without_a_row_is_a_failure() -> None:
+    words = ["-m", "studies.round_trips", "--control", "nonsense", "--rtt", "1", "--mbit", "2", "--senders", "tcp"]
+    done = subprocess.run([sys.executable, *words], cwd=REPO, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "left out: tcp: congestion control 'nonsense': must be one of " in done.stdout
+
+
 def test_congestion_control_of_the_whole_machine_is_left_alone() -> None:
     with pytest.raises(BufgymError, match="in a namespace only"):
         tunnel.HERE.set_congestion_control("reno")
