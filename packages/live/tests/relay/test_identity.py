@@ -55,8 +55,8 @@ async def test_a_token_names_who_it_is(issuer: Issuer) -> None:
 async def test_a_client_reads_its_file_again(issuer: Issuer, tmp_path: Path) -> None:
     """Its token ends, and so does the connection; it is let in again once the file has the next."""
     file = tmp_path / "token"
-    file.write_text(issuer.token(exp=time.time() + 1))
     async with relay(settings(rules=(ANNA,), tokens=replace(issuer.tokens, leeway_s=0.0))) as server:
+        file.write_text(issuer.token(exp=time.time() + 3))  # a client that was never let in would end
         one = Session(f"ws://127.0.0.1:{server.port}", "anna", token=partial(token, file))
         async with beside(one.run()):
             await wait("the first connection", one.ready.wait())
