@@ -58,7 +58,7 @@ EDITED, TEXT, EDIT = Path("model", "qoi.py"), "1.0 - math.exp(d * v[1])", "0.5 *
 """A file, the text in it that V is computed by, and another that halves V. A step reaches it by several calls."""
 
 
-MODULES = {PIPELINE: ("pipeline", "compile", "cache"), PLAIN: ("njit",)}
+MODULES = {PIPELINE: ("pipeline", "templates", "compile", "cache"), PLAIN: ("njit",)}
 """Way to compile -> the modules of ``bufgym/jit`` that it alone has."""
 ROWS_OF_TABLE = (
     "lines of its own in bufgym/jit",

@@ -166,7 +166,6 @@ def page(
 ) -> None:
     """Simulate, and print the table."""
     sums = pool_of(pool, capacity, seeds, duration_s)
-    np.save("/tmp/pool.npy", sums)
     rows = []
     for n in links:
         found = coverage(sums, n, repetitions, resamples, np.random.default_rng(n))

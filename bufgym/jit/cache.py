@@ -25,8 +25,6 @@ class Code:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Code compiled for the types of ``signature``, or None if there is none."""
-        # Rebuilt code finds its functions by name, also those of modules imported since Numba last looked.
-        target.refresh()
         try:
             cached = pickle.loads(self._file(signature, target.codegen()).read_bytes())
             return cast(Any, compiler).CompileResult._rebuild(target, *cached)

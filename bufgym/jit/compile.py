@@ -7,8 +7,9 @@ from typing import Any, TypeVar, cast
 from numba.core import types
 from numba.core.registry import CPUDispatcher
 
+from bufgym.jit import templates  # noqa: F401  (teaches Numba)
 from bufgym.jit.cache import Code
-from bufgym.jit.pipeline import KernelCompiler
+from bufgym.jit.pipeline import PART, KernelCompiler
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -17,7 +18,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # next: together that is five times faster. In return a kernel must neither allocate nor return an array to Python.
 # Compiling takes as long as the code is that is inlined: call a large kernel from one place.
 _OPTIONS = {"nopython": True, "nogil": True, "error_model": "numpy", "_nrt": False}
-_INLINED = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class _Part(CPUDispatcher):
+    """A kernel as other kernels call it."""
+
+    def get_call_template(self, arguments: Any, named: Any) -> Any:
+        """Type a call; one form serves every constant, which LLVM propagates when it inlines the form."""
+        unliteral = cast(Any, types).unliteral
+        kinds = {name: unliteral(kind) for name, kind in named.items()}
+        return cast(Any, super()).get_call_template([unliteral(kind) for kind in arguments], kinds)
 
 
 class _Kernel(CPUDispatcher):
@@ -28,8 +38,8 @@ class _Kernel(CPUDispatcher):
 
     @functools.cached_property
     def _part(self) -> Any:
-        options, part = {**_OPTIONS, **_INLINED}, cast(Any, CPUDispatcher)
-        return part(cast(Any, self).py_func, targetoptions=options, pipeline_class=KernelCompiler)
+        part = cast(Any, _Part)
+        return part(cast(Any, self).py_func, targetoptions={**_OPTIONS, **PART}, pipeline_class=KernelCompiler)
 
     @property
     def _numba_type_(self) -> Any:

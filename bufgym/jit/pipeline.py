@@ -3,6 +3,7 @@
 See docs/methods.md, "Kernels in parts".
 """
 
+from types import CodeType
 from typing import Any, cast
 
 from numba import types
@@ -16,18 +17,41 @@ _Compiler: Any = compiler.Compiler
 _Library: Any = codegen.JITCodeLibrary
 _Model: Any = datamodel.models.TupleModel
 
+PART = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Numba's options for a part: only other kernels call it."""
+_FOR_OTHERS = {
+    "WithLifting",
+    "InlineClosureLikes",
+    "MakeFunctionToJitFunction",
+    "InlineInlinables",
+    "FindLiterallyCalls",
+    "LiteralUnroll",
+    "LiteralPropagationSubPipelinePass",
+    "NopythonRewrites",
+}
+"""Numba's passes for what hardly any kernel has: see ``_is_plain``. The last is for arithmetic of whole arrays, which
+would allocate."""
+_MARKS = {"objmode", "parallel_chunksize", "literally", "literal_unroll"}
+
+
+def _is_plain(code: CodeType) -> bool:
+    """Whether a kernel has no function or comprehension inside it, and names nothing that needs a pass of its own."""
+    return not (_MARKS.intersection(code.co_names) or any(isinstance(one, CodeType) for one in code.co_consts))
+
 
 class KernelCompiler(_Compiler):  # type: ignore[misc]
     """Compiler of the kernels that Python calls, and of the parts that go into them, which are marked to be inlined."""
 
     def __init__(self, typing: Any, target: Any, library: Any, types: Any, result: Any, flags: Any, names: Any) -> None:
-        if flags.forceinline:
-            library = _PartLibrary(target.codegen(), "part")
+        library = (_PartLibrary if flags.forceinline else _WholeLibrary)(target.codegen(), "kernel")
+        library.enable_object_caching()  # so that its machine code can be written to disk
         super().__init__(typing, target, library, types, result, flags, names)
 
     def define_pipelines(self) -> list[Any]:
-        """Numba's own passes, and ``NoneFields`` before all that look at types."""
+        """Numba's own passes as far as a kernel needs them, and ``NoneFields`` before all that look at types."""
         (passes,) = super().define_pipelines()
+        if _is_plain(self.state.func_id.code):
+            passes.passes = [one for one in passes.passes if one[0].__name__ not in _FOR_OTHERS]
         passes.add_pass_after(NoneFields, untyped_passes.IRProcessing)
         passes.finalize()
         return [passes]
@@ -50,16 +74,34 @@ class KernelCompiler(_Compiler):  # type: ignore[misc]
         return result
 
 
-class _PartLibrary(_Library):  # type: ignore[misc]
-    """Code of one part and of the parts that it calls, neither optimised as a whole nor made into machine code."""
+class _UnoptimisedLibrary(_Library):  # type: ignore[misc]
+    """Code whose functions are not optimised one by one, as the whole is."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Leave the functions as they are."""
+        module.data_layout = self._codegen._data_layout
+
+
+class _PartLibrary(_UnoptimisedLibrary):
+    """Code of one part, neither optimised nor made into machine code."""
 
     def finalize(self) -> None:
-        """Link the parts that it calls. After this call nothing can be added."""
-        for library in dict.fromkeys(self._linking_libraries):
+        """Take no more code. What it calls is linked to the whole."""
+        for library in self._linking_libraries:
             self._reload_init.update(library._reload_init)
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
         self._finalize_dynamic_globals()
         self._finalized = True
+
+    @property
+    def own_module(self) -> Any:
+        """Its code without that of the parts that it calls."""
+        return super()._get_module_for_linking()
+
+    def _get_module_for_linking(self) -> Any:
+        """Its code and all that it calls, for a function in a kernel that Numba compiles in its own way."""
+        module = self.own_module.clone()
+        _link(module, self)
+        return module
 
     @property
     def codegen(self) -> Any:
@@ -73,6 +115,36 @@ class _PartLibrary(_Library):  # type: ignore[misc]
         """Address of the function ``name``: 0, as a part has no machine code."""
         self._ensure_finalized()
         return 0
+
+
+def _link(module: Any, caller: Any) -> None:
+    """Add to ``module`` all that ``caller`` calls: each part once, by however many others it is called."""
+    linked: set[Any] = set()
+    waiting = list(caller._linking_libraries)
+    while waiting:
+        library = waiting.pop()
+        if library not in linked:
+            linked.add(library)
+            is_part = isinstance(library, _PartLibrary)
+            waiting += library._linking_libraries if is_part else ()
+            module.link_in(library.own_module if is_part else library._get_module_for_linking(), preserve=True)
+
+
+class _WholeLibrary(_UnoptimisedLibrary):
+    """Code of a kernel that Python calls, with all its parts."""
+
+    def finalize(self) -> None:
+        """Link all parts, optimise, and make machine code."""
+        for library in self._linking_libraries:
+            self._reload_init.update(library._reload_init)
+        _link(self._final_module, self)
+        self._linking_libraries: list[Any] = []
+        super().finalize()
+
+    def _optimize_final_module(self) -> None:
+        """Optimise once. Numba does so twice, before and after it prunes reference counts, and here are none."""
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
 
 
 @cast(Any, datamodel).register_default(types.NamedTuple)

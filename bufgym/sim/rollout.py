@@ -83,7 +83,7 @@ def compiled_rollout(shared: bool, several: bool) -> Any:
 
 # In plain Python a view keeps its arrays alive; the kernel counts no references.
 _view = getattr(view, "py_func", view)
-_inlined: Any = numba.njit(inline="always")(rollout) if JIT else rollout
+_inlined: Any = kernel(rollout)
 
 
 @functools.cache

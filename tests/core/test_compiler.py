@@ -118,6 +118,16 @@ def scaled(number):
 def applied(function, number):
     return function(number)
 
+@numba.njit
+def users_own(a, b):
+    return max(min(a, b), 0) + abs(b)
+
+@kernel
+def mixed(a, b):
+    def inner(c):
+        return c + a
+    return inner(users_own(a, b)) + max(a, b) + int(1.5)
+
 table = np.arange(14.0).reshape(2, 7)
 strided = np.arange(10.0)[::2]
 real = numba.types.float64
@@ -131,6 +141,8 @@ print(json.dumps([
     directly(Numbers(np.array([9.0])), None, None),
     jit.entry_point_of(function)(2.0),
     applied(jit.with_address(real(real), function), 4.0),
+    mixed(3, -2),
+    users_own(3, 2),
 ]))
 """
 
@@ -138,8 +150,11 @@ print(json.dumps([
 @needs_compilation
 @pytest.mark.parametrize("compiler", [pytest.param(way.PIPELINE, marks=pytest.mark.nightly), way.PLAIN])
 def test_all_that_kernels_do_works_in_each_way(compiler: str, tmp_path: Path) -> None:
-    """Row 1 is 7, 8, ... 13: its last number 13 a thousandfold, 13 a hundredfold, then 9 and 12."""
-    results = [4, 13_000 + 1_300 + 9 + 12, 7 + 1, 8 + 5, 9 + 1, 6, 12]
+    """Row 1 is 7, 8, ... 13: its last number 13 a thousandfold, 13 a hundredfold, then 9 and 12.
+
+    A user's own function in a kernel is compiled by Numba in its own way, and the same function apart from it too.
+    """
+    results = [4, 13_000 + 1_300 + 9 + 12, 7 + 1, 8 + 5, 9 + 1, 6, 12, (0 + 2) + 3 + 3 + 1, 2 + 2]
     assert printed(tmp_path, KERNELS, BUFGYM_COMPILER=compiler) == results
     cached = KERNELS.replace("print(", "with jit.cached_only(): print(").replace(
         "function = jit.comp", "with jit.cached_only(): function = jit.comp"
