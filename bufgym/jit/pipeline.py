@@ -94,7 +94,7 @@ class _PartLibrary(_UnoptimisedLibrary):
 
     @property
     def own_module(self) -> Any:
-        """Its code without that of the parts that it calls."""
+        """Its code alone; what it calls is elsewhere."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
