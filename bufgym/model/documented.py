@@ -2,7 +2,9 @@
 
 import ast
 import inspect
-import textwrap
+import linecache
+import re
+import sys
 from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type[Any])
@@ -17,12 +19,16 @@ def documented(named_tuple: Class) -> Class:
 
 
 def below_fields(class_: type[Any]) -> dict[str, str]:
-    """Map each field of a class to the string below it, where one stands there."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(class_))).body
+    """Map each field of a module's class to the string below it, where one stands there."""
+    # inspect.getsource would parse the whole module at each import, to find these lines.
+    text = "".join(linecache.getlines(str(sys.modules[class_.__module__].__file__)))
+    found_at = re.search(rf"^class {class_.__name__}\b.*\n(?:[ \t].*\n|\n)*", text, re.MULTILINE)
+    assert found_at is not None, class_
+    (definition,) = ast.parse(found_at[0]).body
     assert isinstance(definition, ast.ClassDef)
     found: dict[str, str] = {}
-    for field, text in zip(definition.body, definition.body[1:], strict=False):
+    for field, below in zip(definition.body, definition.body[1:], strict=False):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                found[field.target.id] = inspect.cleandoc(str(text.value.value))
+            if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+                found[field.target.id] = inspect.cleandoc(str(below.value.value))
     return found
