@@ -3,8 +3,6 @@
 ``except BufgymError`` catches every error that the caller can put right. Any other exception is a bug in bufgym.
 """
 
-import difflib
-import importlib.metadata
 from collections.abc import Iterable
 from os import PathLike
 
@@ -52,6 +50,8 @@ class TraceWarning(UserWarning):
 
 def unknown(what: str, name: object, known: Iterable[str], also: str = "", place: str = "") -> BufgymError:
     """The error for a name that is not among those ``known``: names the one that was meant, or all of them."""
+    import difflib  # not at start-up, as importlib.metadata below
+
     names = list(known)
     close = difflib.get_close_matches(str(name), names, 1)
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{also}"
@@ -93,6 +93,8 @@ def install(extra: str) -> str:
 
     pip finds the extra in what is installed, so no package index needs to know bufgym.
     """
+    import importlib.metadata  # takes longer than all the rest of ``import bufgym``
+
     package, _, bracket = (extra if "[" in extra else f"bufgym[{extra}]").partition("[")
     try:
         importlib.metadata.version(package)
