@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym import traces
 from bufgym.model import qoi
 from bufgym.model.checks import whole
 from bufgym.model.link import MAX_TIME_US, Link
@@ -19,7 +20,7 @@ from bufgym.scenario.checks import as_tuple, check_sizes, check_stream, check_va
 from bufgym.scenario.draws import SIZES, derived_generator, place, place_link, shipped, sizes, skip
 from bufgym.scenario.episode import Episode, Streams
 from bufgym.scenario.texts import how_rated, links_by_name, motions_by_name
-from bufgym.traces import Motion, Trace, read_workload
+from bufgym.traces import Motion, Trace
 from bufgym.traces.generate.sizes import EQUAL, Moving, drawn
 from bufgym.traces.trace import MAX_DURATION_S
 from bufgym.traces.workload import Workload
@@ -103,7 +104,7 @@ class Uplink:
                 f"link_offset_s = {self.link_offset_s}: must be (from, to) with 0 <= from <= to <= {MAX_DURATION_S}, s"
             )
         if isinstance(self.workload, str | Path):
-            object.__setattr__(self, "workload", read_workload(self.workload))
+            object.__setattr__(self, "workload", traces.read_workload(self.workload))
         if self.workload is not None and not isinstance(self.workload, Workload):
             raise BufgymError(f"workload: {self.workload!r} is not a bufgym.traces Workload")
         if self.workload is not None and self.workload.x is not None and self.motion:

@@ -11,23 +11,28 @@ An argument out of its range raises a BufgymError. A file that cannot be read or
 format, raises its subclass TraceError, whose message names the file, the line, the value and the rule.
 """
 
-from bufgym.traces.formats.bags import read_bag
-from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
-from bufgym.traces.formats.motions import read_motion, write_motion_csv
-from bufgym.traces.formats.recordings import read_workload, workload_from_bag
-from bufgym.traces.formats.trajectories import read_poses
-from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
-from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
-from bufgym.traces.generate.driving import drive_motion
-from bufgym.traces.generate.lte import synthetic_lte
-from bufgym.traces.generate.markov import markov_link
-from bufgym.traces.generate.parameters import fitted_links, read_links
-from bufgym.traces.generate.rules import ramp, steady, tunnel
+from typing import TYPE_CHECKING
+
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses
 from bufgym.traces.shipped import load, load_motion, shipped
 from bufgym.traces.trace import Trace, describe
 from bufgym.traces.workload import Workload
+from bufgym.utils.modules import on_demand
+
+if TYPE_CHECKING:
+    from bufgym.traces.formats.bags import read_bag
+    from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
+    from bufgym.traces.formats.motions import read_motion, write_motion_csv
+    from bufgym.traces.formats.recordings import read_workload, workload_from_bag
+    from bufgym.traces.formats.trajectories import read_poses
+    from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
+    from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
+    from bufgym.traces.generate.driving import drive_motion
+    from bufgym.traces.generate.lte import synthetic_lte
+    from bufgym.traces.generate.markov import markov_link
+    from bufgym.traces.generate.parameters import fitted_links, read_links
+    from bufgym.traces.generate.rules import ramp, steady, tunnel
 
 __all__ = [
     "FORMATS", "WRITERS", "Motion", "MotionSettings", "Poses", "Trace", "Workload", "describe", "detect_format",
@@ -36,3 +41,19 @@ __all__ = [
     "shipped", "steady", "synthetic_lte", "tunnel", "workload_from_bag", "write_csv", "write_mahimahi",
     "write_motion_csv", "write_workload_csv",
 ]  # fmt: skip
+
+__getattr__ = on_demand(__name__, {
+    "read_bag": "formats.bags", "FORMATS": "formats.links", "detect_format": "formats.links",
+    "read_trace": "formats.links", "read_motion": "formats.motions", "write_motion_csv": "formats.motions",
+    "read_workload": "formats.recordings", "workload_from_bag": "formats.recordings",
+    "read_poses": "formats.trajectories", "read_workload_csv": "formats.workloads",
+    "write_workload_csv": "formats.workloads", "WRITERS": "formats.writers", "difference": "formats.writers",
+    "write_csv": "formats.writers", "write_mahimahi": "formats.writers", "drive_motion": "generate.driving",
+    "synthetic_lte": "generate.lte", "markov_link": "generate.markov", "fitted_links": "generate.parameters",
+    "read_links": "generate.parameters", "ramp": "generate.rules", "steady": "generate.rules",
+    "tunnel": "generate.rules",
+})  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -3,21 +3,23 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
-from bufgym.traces.generate.lte import LteMode
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import After, Trace
 from bufgym.utils import files
 from bufgym.utils.units import rate_of
 
+if TYPE_CHECKING:
+    from bufgym.traces.generate.lte import LteMode
+
 # Mode and mean in bytes/s of lte-synthetic-<seed>.csv. The means lie around the 6.9 MB/s of 30 frames of 230 kB a
 # second: from a link that barely suits a robot to one where only breakdowns are a problem.
-SHIPPED_LTE: Final[tuple[tuple[LteMode, float], ...]] = (
+SHIPPED_LTE: Final[tuple[tuple["LteMode", float], ...]] = (
     *(("walk", 8e6), ("walk", 10e6), ("walk", 12e6)),
     *(("drive", 8e6), ("drive", 10e6), ("drive", 12e6)),
     *(("train", 9e6), ("train", 11e6)),

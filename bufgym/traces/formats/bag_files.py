@@ -8,16 +8,18 @@ can make a small file endless. So rosbag2's SQLite files are read by two plain q
 import bz2
 import io
 import os
-import sqlite3
 import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, TYPE_CHECKING, Any, Final
 
 from bufgym.traces.formats.definitions import BagTopic, ros_type
 from bufgym.utils.files import unpacked_limit
+
+if TYPE_CHECKING:
+    import sqlite3
 
 # A chunk of a recording has some MB, a robot some hundred topics; more is a mistake, or a bomb.
 MAX_CHUNK_BYTES: Final = 2**28
@@ -181,6 +183,8 @@ def _add(types: dict[str, str], topic: str, type: str) -> None:
 
 def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
     """Every message of one of rosbag2's SQLite files; one with a journal must be a copy, because SQLite changes it."""
+    import sqlite3  # few read such files, and all that read a trace look whether it is a recording
+
     mode = "mode=rw" if journals(path) else "mode=ro&immutable=1"
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{mode}", uri=True)) as base:
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
@@ -205,8 +209,10 @@ def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
             yield channels[number], logged_ns, data
 
 
-def _definitions(base: sqlite3.Connection) -> Iterator[tuple[str, tuple[str, str]]]:
+def _definitions(base: "sqlite3.Connection") -> Iterator[tuple[str, tuple[str, str]]]:
     """Each type that a SQLite file defines, as since ROS 2 Iron, with the text and its language."""
+    import sqlite3
+
     if base.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'message_definitions'").fetchone():
         query = "SELECT topic_type, encoded_message_definition, encoding FROM message_definitions"
         # A text over the limit of a message is no definition.

@@ -41,7 +41,12 @@ class Format:
 
 def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:
     """Whether a line is cells of these patterns."""
-    return re.compile(between.join(patterns)).fullmatch
+
+    def fits(text: str) -> bool:
+        cells = re.split(between, text, maxsplit=len(patterns) - 1)
+        return len(cells) == len(patterns) and all(map(re.fullmatch, patterns, cells))
+
+    return fits
 
 
 FORMATS: Final[dict[str, Format]] = {
