@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, wait
 from typing import TypeVar
 
 Result = TypeVar("Result")
@@ -16,6 +15,8 @@ def interruptible(work: Callable[[], Result]) -> Result:
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
+    from concurrent.futures import Future, wait  # not at start-up: it imports logging, and most work is short
+
     future: Future[Result] = Future()
 
     def carry_out() -> None:

@@ -2,10 +2,13 @@
 
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 
 class Threads:
@@ -25,6 +28,8 @@ class Threads:
     def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
         """Call ``work`` on every part; return when all are done."""
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
+            from concurrent.futures import ThreadPoolExecutor  # not at start-up: most batches have one part
+
             self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
         running = [self._pool.submit(work, part) for part in self.parts[1:]]
         work(self.parts[0])
