@@ -63,11 +63,29 @@ def test_every_public_name_of_a_package_is_found_where_the_package_says(package:
         getattr(module, "no_such_name")  # noqa: B009  (mypy knows that it is missing)
 
 
-def test_importing_bufgym_imports_nothing_heavy() -> None:
+NEEDED_LATER = (
+    "asyncio", "concurrent", "cyclopts", "difflib", "filelock", "joblib", "logging", "pooch", "requests", "safetensors",
+    "sqlite3", "ssl", "tqdm",
+)  # fmt: skip
+"""What a first step does without, of Python and of libraries."""
+MADE = "'bufgym/Uplink-v0', capacity=8"
+FIRST = {
+    "import": "",
+    "step": f"e = gymnasium.make({MADE}); e.reset(seed=0); e.step(0)",
+    "batch": f"e = gymnasium.make_vec({MADE}, num_envs=2); e.reset(seed=0); e.step(e.action_space.sample())",
+    "compare": "print(bufgym.compare(['afr', 'drop-oldest'], 'lte', seeds=1, duration_s=0.2), file=sys.stderr)",
+}
+
+
+@pytest.mark.parametrize("program", FIRST.values(), ids=FIRST)
+def test_a_first_step_imports_nothing_heavy(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba itself opens scipy where that is installed: what core dependencies bring is not bufgym's doing."""
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+    unwanted = set(HEAVY + NEEDED_LATER)
     before = "import sys, numpy, gymnasium, numba; core = {*sys.modules}; import bufgym"
-    extra = output_of(f"{before}; print(*[m for m in {{*sys.modules}} - core if m.split('.')[0] in {HEAVY!r}])").split()
-    assert not extra, f"import bufgym also imports {sorted(extra)[:5]}"
+    after = f"{{m for m in {{*sys.modules}} - core if m.split('.')[0] in {unwanted!r}}}"
+    extra = output_of(f"{before}\n{program}\nprint(*{after})").split()
+    assert not extra, f"it also imports {sorted(extra)[:5]}"
 
 
 def test_sb3_without_its_extra_names_it() -> None:

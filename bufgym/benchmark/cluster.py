@@ -3,7 +3,6 @@
 import itertools
 import os
 from collections.abc import Iterable, Iterator
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -27,6 +26,8 @@ def spread(
 
     Raises WorkerDiedError: results that other workers had not returned by then are lost.
     """
+    from concurrent.futures.process import BrokenProcessPool  # with processes come queues, pickles and logs
+
     joblib = library("joblib", "bench")
     wrapped = (joblib.delayed(function)(*arguments) for function, arguments in calls)
     # Worker processes end with this process, even before they have work. They never end by themselves, because loky

@@ -66,6 +66,32 @@ def test_times_in_ns_are_exact_and_a_file_written_is_read_back(tmp_path: Path) -
     refuse("cannot be written", write_motion_csv, motion, tmp_path, kind=TraceError)
 
 
+@pytest.mark.parametrize("block_bytes", [7, 40, 2**20])
+def test_a_block_of_coordinates_and_its_lines_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    """Two coordinates of one time, of which the last counts; the last lines break a rule, one in each file."""
+    sound = "# by hand\nt_s,motion\n0,0.1\n.1,.30\n+1e-1,0.4\n0.7000005,1.25\n2,1.25\n"
+    sources = [
+        f"{sound}{end}" for end in ("", "3,1.2\n", "1,2\n", "3,4,5\n", "3\n", "\n\n3,nan\n", "3,2e9\n", "-1,2\n")
+    ]
+    files = [written(tmp_path, text, f"{k}.csv") for k, text in enumerate(sources)]
+
+    def read(path: Path) -> list[object]:
+        try:
+            motion = read_motion(path)
+        except TraceError as error:
+            return [str(error)]
+        return [motion.time_us.tolist(), motion.coordinate.tolist(), motion.source]
+
+    monkeypatch.setattr("bufgym.traces.formats.text._BLOCK_BYTES", block_bytes)
+    blocks = [read(path) for path in files]
+    monkeypatch.setattr("bufgym.traces.formats.motions._motion_block", lambda block, previous: None)
+    assert blocks == [read(path) for path in files]
+    assert blocks[0][:2] == [[0, 100_000, 700_000, 2_000_000], [0, 0.4 - 0.1, 1.25 - 0.1, 1.25 - 0.1]]
+    assert all(", line 8" in str(fault) or ", line 10" in str(fault) for (fault,) in blocks[1:])
+
+
 def test_kitti_times_from_elsewhere(tmp_path: Path) -> None:
     path = written(tmp_path, KITTI, "00.txt")
     refuse(r"holds KITTI matrices, which carry no time: .*no 00_times.txt beside", read_motion, path, kind=TraceError)

@@ -17,7 +17,7 @@ from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Arr
 
 RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
 """Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values."""
-BlockReader = Callable[[bytes], "tuple[Int64Array, Float64Array] | None"]
+BlockReader = Callable[[bytes, list[float] | None], "tuple[Int64Array, Float64Array] | None"]
 """Parses lines of plain numbers into times in us, int64[m], and values, float64[m, columns]; None for other lines."""
 
 _COUNTED: Final = 1000  # Lines from one call of a progress bar to the next, at most
@@ -47,8 +47,10 @@ def read_rows(
     kept = _Kept(path, what)
     with open_text(path) as file:
         for number, block in file.blocks():
+            above = block.split(b"\n", max(0, skip + 1 - number))  # the lines to skip, then all others
+            number, block = number + len(above) - 1, above[-1]
             lines = block.count(b"\n") + (not block.endswith(b"\n"))
-            parsed = None if read_block is None or number <= skip else read_block(block)
+            parsed = None if read_block is None else read_block(block, kept.previous)
             if parsed is None or len(parsed[0]) != lines or not kept.takes(parsed[0]):
                 for numbers, time_us, values in _by_line(file, number, block, read_row, skip, kept, advance):
                     kept.add(numbers, time_us, values)

@@ -35,7 +35,7 @@ POSE_FORMATS: Final = ("tum", "euroc", "kitti")
 MAX_POSITION_M: Final = 1e7
 NORM_TOLERANCE: Final = 0.01
 # Seconds since 1970 until the year 5138; a time in ns exceeds it.
-_MAX_EPOCH_S: Final = 1e11
+MAX_EPOCH_S: Final = 1e11
 _EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
 # State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
 _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
@@ -43,7 +43,7 @@ _NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("p
 _OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
 _SURE_NORM: Final = NORM_TOLERANCE - 1e-9  # Whatever the rounding of the norm
-_PLAIN: Final = b"0123456789+-.eE, \t\r\n"  # A block of other bytes is read line by line
+PLAIN: Final = b"0123456789+-.eE, \t\r\n"  # A block of other bytes is read line by line
 
 
 def read_poses(
@@ -114,7 +114,7 @@ def _detected(path: StrPath) -> tuple[str, str]:
 
 def seconds(line: Line, text: str) -> int:
     """A time in s, as microseconds."""
-    return round(line.decimal("time in s", text, 0, _MAX_EPOCH_S) * US_PER_S)
+    return round(line.decimal("time in s", text, 0, MAX_EPOCH_S) * US_PER_S)
 
 
 def _pose_row(format: str, unit: str) -> RowReader:
@@ -133,11 +133,11 @@ def _pose_row(format: str, unit: str) -> RowReader:
 
 def _pose_block(format: str, unit: str) -> BlockReader:
     """The reader of a block of such lines, as `_pose_row` reads each."""
-    time_type, most = ("f8", _MAX_EPOCH_S) if unit == "s" else ("i8", _MAX_EPOCH_S / UNIT_S[unit])
+    time_type, most = ("f8", MAX_EPOCH_S) if unit == "s" else ("i8", MAX_EPOCH_S / UNIT_S[unit])
     ticks = round(1 / (UNIT_S[unit] * US_PER_S))  # in a microsecond; 0 where the unit is longer
 
-    def block(text: bytes) -> tuple[Int64Array, Float64Array] | None:
-        if text.translate(None, _PLAIN):
+    def block(text: bytes, previous: list[float] | None) -> tuple[Int64Array, Float64Array] | None:
+        if text.translate(None, PLAIN):
             return None
         lines = text.decode("ascii").split("\n")
         columns = len(_cells(Line("", 0, lines[0].strip())))
@@ -166,7 +166,7 @@ def _time_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
-    line.decimal(f"time in {unit}", text, 0, _MAX_EPOCH_S / UNIT_S[unit])
+    line.decimal(f"time in {unit}", text, 0, MAX_EPOCH_S / UNIT_S[unit])
     # A float holds such a time to 256 ns only.
     return int(Decimal(text) * Decimal(str(UNIT_S[unit])) * US_PER_S)
 
