@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.jit import kernel
+from bufgym.kernels.source import generated
 
 # So that 0 / (0 + reference) is 0 where nothing moved at all.
 TINY = 1e-30
@@ -90,7 +91,8 @@ def _made(fields: Sequence[Field], arguments: str, lines: Sequence[str]) -> Any:
     for i, field in enumerate(fields):
         _IN_TABLES[field.function.__module__, field.name] = field
         names[f"field_{i}"] = kernel(field.function)
-    exec("\n    ".join([f"def write({arguments}):", *lines]), names)
+    text = "\n    ".join([f"def write({arguments}):", *lines])
+    exec(compile(text, generated(text), "exec"), names)
     return kernel(names["write"])
 
 
