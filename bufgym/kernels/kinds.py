@@ -147,9 +147,8 @@ def _item_kind(dtype: np.dtype[Any]) -> Number | Record:
                 raise KernelError(f"field {name!r} of a record is {dtype[name]}: kernels know whole numbers and floats")
         fields: dict[str, Any] = dict(dtype.fields or {})
         here: Any = {"names": dtype.names, "formats": [fields[n][0] for n in dtype.names]}
-        plain: np.dtype[Any] = np.dtype(
-            {**here, "offsets": [fields[n][1] for n in dtype.names], "itemsize": dtype.itemsize}
-        )
+        here |= {"offsets": [fields[n][1] for n in dtype.names], "itemsize": dtype.itemsize}
+        plain: np.dtype[Any] = np.dtype(here)
         if plain != np.dtype([(name, dtype[name]) for name in dtype.names], align=True):
             raise KernelError("a record's fields have gaps that C's do not have: make its dtype with align=True")
         return Record(np.dtype([(name, dtype[name].str) for name in dtype.names], align=True))
