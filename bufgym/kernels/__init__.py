@@ -8,8 +8,8 @@ names file and line.
 - Arrays in C order: elements, rows, ``len``, ``shape``; the last index may be a slice. A negative index counts from the
   end. Nothing tests an index, but in a checked program. Nothing is allocated.
 - Records by their fields, which change the array; tuples and named tuples, which do not change.
-- ``if``, ``while``, ``for`` over a range or an array, ``break``, ``continue``, ``return``; ``x is None`` is settled when
-  a kernel is translated.
+- ``if``, ``while``, ``for`` over a range or an array, ``break``, ``continue``, ``return``; ``x is None`` is settled
+  when a kernel is translated.
 - Calls: other functions of this language, ``min``, ``max``, ``abs``, ``int``, ``float``, ``bool``, ``math``, and the
   ``unchecked_...`` functions of ``bufgym.jit``. No function calls itself.
 """

@@ -6,6 +6,7 @@ See docs/methods.md, "The clairvoyant, long episodes".
 import os
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +78,6 @@ def _solved(
     messages: Messages, between: Ints, idle: Ints, grid: int, pieces: list[Piece]
 ) -> Iterator[tuple[Piece, Problem]]:
     """Yield each piece with its programme, its ``future`` filled; a few are computed at a time."""
-    from concurrent.futures import Future, ThreadPoolExecutor  # not at start-up: few episodes are that long
 
     def solve(piece: Piece) -> Problem:
         part, base = slice(piece.begin, piece.end), int(messages.c[piece.begin]) // grid * grid
