@@ -64,7 +64,7 @@ def test_every_public_name_of_a_package_is_found_where_the_package_says(package:
 
 
 NEEDED_LATER = (
-    "asyncio", "concurrent", "cyclopts", "difflib", "filelock", "joblib", "logging", "pooch", "requests", "safetensors",
+    "asyncio", "cyclopts", "difflib", "filelock", "joblib", "logging", "pooch", "requests", "safetensors",
     "sqlite3", "ssl", "tqdm",
 )  # fmt: skip
 """What a first step does without, of Python and of libraries."""
