@@ -10,7 +10,7 @@ import numpy as np
 
 from bufgym.jit import arrays
 from bufgym.kernels.kinds import BOOL, FLOAT, INT, NONE, SINGLE, Array, Given, Number, Pointer, Tuple, joined
-from bufgym.kernels.scope import Value, name_in_c
+from bufgym.kernels.scope import OF_C, Value, name_in_c
 from bufgym.kernels.source import plain
 from bufgym.kernels.subscripts import Subscripts
 
@@ -18,8 +18,6 @@ _CASTS: dict[Any, Any] = {
     float: FLOAT, int: INT, bool: BOOL, np.float64: FLOAT, np.float32: SINGLE,
     **dict.fromkeys((np.int64, np.int32, np.uint64), INT),
 }  # fmt: skip
-_OF_C = ("sqrt", "exp", "log", "log1p", "expm1", "tanh", "sin", "cos", "tan", "asin", "acos", "atan", "fabs", "hypot",
-         "atan2", "pow", "log2", "log10", "sinh", "cosh", "copysign", "fmod")  # fmt: skip
 _FIELD_KINDS = {"float": FLOAT, "int": INT, "bool": BOOL, float: FLOAT, int: INT, bool: BOOL}
 
 
@@ -39,7 +37,7 @@ class Calls(Subscripts):
         make = _BUILT_IN.get(function) if getattr(function, "__hash__", None) else None
         if make is not None:
             return make(self, node)
-        if getattr(function, "__module__", "") == "math" and function.__name__ in _OF_C:
+        if getattr(function, "__module__", "") == "math" and function.__name__ in OF_C:
             texts = [self.cast(self.number(argument), FLOAT) for argument in node.args]
             return Value(f"{function.__name__}({', '.join(texts)})", FLOAT)
         return self.kernel(node, function)

@@ -23,7 +23,10 @@ from bufgym.utils.errors import BufgymError, unknown, where
 from bufgym.utils.files import replaced
 
 _NAMES: Final = ("cc", "gcc", "clang")
-_LIBM: Final = ("exp", "exp2", "expm1", "lgamma", "log", "log10", "log1p", "log2", "pow", "tanh")
+_LIBM: Final = (
+    *("exp", "exp2", "expm1", "lgamma", "log", "log10", "log1p", "log2", "pow", "tanh"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "hypot"),
+)
 """Functions whose result may differ between libraries in the last bit."""
 _FLAGS: Final = (
     *("-std=c11", "-O2", "-w", "-fwrapv", "-fno-semantic-interposition"),

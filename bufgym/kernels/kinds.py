@@ -167,30 +167,3 @@ def record_kind(dtype: Any) -> Record:
     kind = _item_kind(np.dtype(dtype))
     assert isinstance(kind, Record)
     return kind
-
-
-def kind_of(value: Any) -> Kind:
-    """The kind of a Python value as a kernel's argument; KernelError if it has none."""
-    if isinstance(value, np.ndarray):
-        return array_kind(value.dtype, value.ndim)
-    if isinstance(value, tuple):
-        names = getattr(type(value), "_fields", ())
-        return Tuple(tuple(map(kind_of, value)), names, type(value).__name__ if names else "tuple")
-    if value is None:
-        return NONE
-    if isinstance(value, bool | np.bool_):
-        return BOOL
-    if isinstance(value, int | np.integer):
-        return INT
-    if isinstance(value, np.float32):
-        return SINGLE
-    if isinstance(value, float | np.floating):
-        return FLOAT
-    if isinstance(value, np.void):
-        return record_kind(value.dtype)
-    kind = getattr(value, "kernel_kind", None)
-    if kind is not None:
-        return kind
-    if callable(value) and hasattr(value, "__code__"):
-        return Given(value)
-    raise KernelError(f"{value!r}: a kernel takes numbers, arrays, tuples of them, records and None")

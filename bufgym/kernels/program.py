@@ -48,7 +48,7 @@ class Program:
                                 [f"{item} *p;", *(f"int64_t n{axis};" for axis in range(kind.axes))])  # fmt: skip
         if isinstance(kind, Record):
             fields = [f"{kind.kind_of(name).c} {name_in_c(name)};" for name in kind.dtype.names or ()]
-            return self._struct(kind, NAMES.get(kind.dtype, "record"), fields) + " *"
+            return self._struct(kind, "record", fields) + " *"
         if isinstance(kind, Tuple):
             named = [(self.c_type(item), name) for item, name in zip(kind.items, self.members(kind), strict=True)
                      if item is not NONE and not isinstance(item, Given)]  # fmt: skip
@@ -137,7 +137,7 @@ class Program:
         self._texts.append(f"{head}\nEXPORT const char *{symbol}(struct {struct} *call)\n{{\n{body}\n}}\n")
         return made.result
 
-    def hook(self, symbol: str, function: Any, pointer: Pointer, linkage: str = "EXPORT") -> None:
+    def hook(self, symbol: str, function: Any, pointer: Pointer) -> None:
         """Add ``symbol``, a function that is called through a pointer of this kind."""
         made, name = self._inferred(function, pointer.arguments), self._emitted(function, pointer.arguments)
         if (made.result is None) != (pointer.result is None):
@@ -148,19 +148,9 @@ class Program:
         result = self.c_type(pointer.result) if pointer.result else "void"
         if pointer.result:
             call = f"return {made.cast(Value(call, made.result), pointer.result)}"
-        self._texts.append(f"{linkage} {result} {symbol}({', '.join(heads)})\n{{\n    {call};\n}}\n")
+        self._texts.append(f"EXPORT {result} {symbol}({', '.join(heads)})\n{{\n    {call};\n}}\n")
 
     def source(self) -> str:
         """The whole program."""
         head = "#define BG_CHECKED\n" * self.checked
         return "\n".join([head + PRELUDE, *self._structs, "", *self._texts])
-
-
-NAMES: dict[np.dtype[Any], str] = {}
-"""Records that have a name in C."""
-
-
-def name_record(name: str, dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """Give the records of ``dtype`` a name in C; returns ``dtype``."""
-    NAMES[np.dtype([(field, dtype[field].str) for field in dtype.names or ()], align=True)] = name
-    return dtype

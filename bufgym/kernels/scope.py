@@ -14,11 +14,17 @@ from bufgym.utils.files import PACKAGE
 if TYPE_CHECKING:
     from bufgym.kernels.program import Program
 
+OF_C = (
+    "sqrt", "exp", "log", "log1p", "expm1", "tanh", "sin", "cos", "tan", "asin", "acos", "atan", "fabs", "hypot",
+    "atan2", "pow", "log2", "log10", "sinh", "cosh", "copysign", "fmod",
+)  # fmt: skip
+"""Functions of Python's ``math`` that C has by the same name."""
 _RESERVED = {
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
     "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
     "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while", "bool", "true", "false",
-    "INFINITY", "NAN", "asm", "typeof",
+    "INFINITY", "NAN", "asm", "typeof", *OF_C, "ceil", "floor", "fabsf", "memcpy", "memmove",
+    "isnan", "isinf", "isfinite", "KERNEL", "EXPORT", "CALLED", "RETURNED",
 }  # fmt: skip
 _ATOM = re.compile(r"-?[\w.]+|[\w.>\[\]-]+|\w+\([^()]*\)|\([^()]*\)")
 
@@ -40,10 +46,15 @@ class Value(NamedTuple):
         """Whether a kernel is called, so that order counts."""
         return "k_" in self.text or " = " in self.text
 
+    @property
+    def reads(self) -> bool:
+        """Whether an array or a record is read, which a kernel may change."""
+        return "->" in self.text or "[" in self.text
+
 
 def name_in_c(name: str) -> str:
-    """A Python name in C."""
-    return f"{name}_" if name in _RESERVED else name
+    """A Python name in C. Names that begin with ``bg_`` or ``k_`` are the translator's own."""
+    return f"{name}_" if name in _RESERVED or name.startswith(("bg_", "k_")) else name
 
 
 class NotYetError(Exception):
@@ -89,26 +100,25 @@ class Scope:
 
     def temporary(self, kind: Kind) -> str:
         """A new variable of this kind."""
-        name = f"t{len(self.temporaries) + 1}"
+        name = f"bg_t{len(self.temporaries) + 1}"
         self.temporaries[name] = kind
         return name
 
     def fixed(self, value: Value) -> tuple[list[str], Value]:
         """(What to evaluate before, the value), so that the value may be named twice."""
-        if not value.calls and len(value.text) < 60:
-            return [], value
+        return self._kept(value) if value.calls or len(value.text) >= 60 else ([], value)
+
+    def _kept(self, value: Value) -> tuple[list[str], Value]:
         name = self.temporary(value.kind)
         return [f"{name} = {value.text}"], Value(name, value.kind, value.known)
 
     def in_order(self, values: list[Value]) -> tuple[list[str], list[Value]]:
         """(What to evaluate before, the values): Python evaluates from left to right, C as it likes."""
         last = max((k for k, value in enumerate(values) if value.calls), default=0)
-        if sum(value.calls for value in values) < 2:
-            return [], values
         before: list[str] = []
         for k, value in enumerate(values[:last]):
-            if value.calls:
-                first, values[k] = self.fixed(value)
+            if value.calls or value.reads:  # what the last call may change is read before it
+                first, values[k] = self._kept(value)
                 before += first
         return before, values
 

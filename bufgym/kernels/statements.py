@@ -32,9 +32,9 @@ class Function(Expressions):
         self._run()
         c_type = self.program.c_type
         heads = [f"{c_type(kind)} {name_in_c(argument)}" for argument, kind in self.parameters()]
-        variables = {**{n: k for n, k in self.kinds.items() if n not in self.arguments}, **self.temporaries}
-        own = [f"    {c_type(kind)} {name_in_c(n)}{' = 0' * isinstance(kind, Number)};"
-               for n, kind in variables.items() if kind is not NONE and not isinstance(kind, Given)]  # fmt: skip
+        variables = {name_in_c(n): kind for n, kind in self.kinds.items() if n not in self.arguments} | self.temporaries
+        in_c = {n: kind for n, kind in variables.items() if kind is not NONE and not isinstance(kind, Given)}
+        own = [f"    {c_type(kind)} {n}{' = 0' * isinstance(kind, Number)};" for n, kind in in_c.items()]
         if isinstance(self.result, Number) and not isinstance(self.tree.body[-1], ast.Return):
             self.lines.append("    return 0;")
         result = c_type(self.result) if self.result else "void"
@@ -183,6 +183,8 @@ class Function(Expressions):
         indices = target.slice.elts if isinstance(target.slice, ast.Tuple) else []
         if len(indices) == 2 and isinstance(indices[0], ast.Slice) and not isinstance(indices[1], ast.Slice):
             return self.fill_column(target, indices[0], indices[1], value, depth)
+        if value.calls:  # Python finds the place after the value
+            value = self._copied(value, depth)
         before, place = self.subscript(target)
         for one in before:
             self.emit(depth, f"{one};")
@@ -240,7 +242,7 @@ class Function(Expressions):
             value = self._copied(value, depth)
         text = self.cast(value, part.kind.item)
         self.loops += 1
-        k = f"j{self.loops}"
+        k = f"bg_j{self.loops}"
         self.emit(depth, f"for (int64_t {k} = 0; {k} < {' * '.join(axes)}; {k}++) {name}.p[{k}] = {text};")
 
     def st_If(self, node: ast.If, depth: int) -> bool:
@@ -268,7 +270,7 @@ class Function(Expressions):
         if node.orelse:
             raise self.refused(node, "a loop has no else in kernels")
         self.loops += 1
-        k, end = f"i{self.loops}", f"end{self.loops}"
+        k, end, by = f"bg_i{self.loops}", f"bg_end{self.loops}", f"bg_step{self.loops}"
         is_range = isinstance(node.iter, ast.Call) and ast.unparse(node.iter.func) == "range"
         if not is_range:
             before, array = self.fixed(self.ex(node.iter))
@@ -285,8 +287,8 @@ class Function(Expressions):
             first = numbers[0].text if len(numbers) > 1 else "0"
             last = numbers[min(1, len(numbers) - 1)].text
             step = numbers[2] if len(numbers) > 2 else Value("1", INT, 1)
-            more = "" if step.known is not None else f", step{self.loops} = {step.text}"
-            by = step.text if step.known is not None else f"step{self.loops}"
+            more = "" if step.known is not None else f", {by} = {step.text}"
+            by = step.text if step.known is not None else by
             test = f"{k} < {end}" if (step.known or 0) > 0 else f"{k} > {end}"
             if step.known is None:
                 test = f"{by} > 0 ? {k} < {end} : {k} > {end}"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from needs import needs
 
 from bufgym import policies, scenario
 from bufgym.kernels import compiler
@@ -22,7 +23,7 @@ from bufgym.policies import registry
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 
-pytestmark = pytest.mark.skipif(compiler.find() is None, reason=f"no C compiler: {compiler.HINT}")
+pytestmark = pytest.mark.skipif(compiler.find() is None, reason=needs("compiler"))
 
 
 def view_kind() -> Tuple:
@@ -145,6 +146,39 @@ def test_arithmetic_is_pythons(a: int, b: int, x: float, y: float) -> None:
     np.testing.assert_array_equal(one[[0, 1, 3, 4, 5, 6, 7, 8, 9, 10]], other[[0, 1, 3, 4, 5, 6, 7, 8, 9, 10]])
     # Python's own // of floats takes the remainder away first.
     assert one[2] == math.floor(x / y)
+
+
+def grow(numbers: Any) -> float:
+    """Add one to the first number; return it."""
+    numbers[0] += 1.0
+    return float(numbers[0])
+
+
+def ordered(numbers: Any) -> float:
+    """Sums whose second part changes what the first has read."""
+    total = numbers[0] + 10.0 * grow(numbers) + 100.0 * numbers[0]
+    numbers[int(numbers[0])] = grow(numbers)
+    numbers[0] += grow(numbers)
+    return float(total + (1000.0 if numbers[0] < grow(numbers) <= numbers[0] else 0.0))
+
+
+def names_of_c(x: float, bg_t1: int) -> float:
+    """Variables with names that C or the translator has."""
+    log, t1, i1, end1, double = math.log(x), 1.0, 2.0, 3.0, 4.0
+    for k_x in range(bg_t1):
+        t1 += k_x * max(log, i1) + end1 * double
+    return math.log(x) + t1
+
+
+def test_a_sum_is_read_from_left_to_right() -> None:
+    made, one, other = in_c(ordered, Pointer((MEMORY,), FLOAT)), np.arange(9.0), np.arange(9.0)
+    assert made(one) == ordered(other)
+    np.testing.assert_array_equal(one, other)
+
+
+def test_names_that_c_has_are_no_trouble() -> None:
+    made = in_c(names_of_c, Pointer((FLOAT, INT), FLOAT))
+    assert made(7.5, 4) == names_of_c(7.5, 4)
 
 
 def makes_a_list(a: int) -> int:
