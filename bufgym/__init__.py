@@ -8,6 +8,7 @@ envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
 print(bufgym.compare(["afr", "drop-oldest"], "lte", capacity=8))
 """
 
+from importlib.metadata import entry_points as _entry_points
 from typing import TYPE_CHECKING
 
 import gymnasium as _gym
@@ -17,7 +18,6 @@ from bufgym.utils.errors import BufgymError as BufgymError
 from bufgym.utils.modules import on_demand as _on_demand
 from bufgym.utils.packages import ENVIRONMENTS as _GROUP
 from bufgym.utils.packages import absent as _absent
-from bufgym.utils.packages import declared as _declared
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
@@ -37,7 +37,8 @@ ENVIRONMENTS = {
 """Id -> (name of the scenario, its description, arguments that differ from the usual). Installed packages declare more
 of them, as entry points of the group ``bufgym.environments``."""
 
-for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_declared(_GROUP)}.items():
+_others = {entry.name: entry.load() for entry in _entry_points(group=_GROUP)}
+for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
     if _id not in _gym.registry:
         _gym.register(
             _id,

@@ -68,8 +68,8 @@ def test_training_is_told(capsys: Capsys) -> None:
 def test_an_environment_of_a_package_is_told_when_it_is_made(monkeypatch: Patch) -> None:
     """In a fresh process without any package; ``list`` shows only what can be made."""
     program = """
-import glob
-glob.iglob = lambda pattern: iter(())  # no package's entry points
+import importlib.metadata
+importlib.metadata.entry_points = lambda group: importlib.metadata.EntryPoints()
 import gymnasium as gym, bufgym
 from bufgym.cli.listing import environments
 print(*environments())

@@ -18,7 +18,7 @@ from needs import needs
 
 import bufgym
 from bufgym import cli
-from bufgym.utils import errors, packages
+from bufgym.utils import errors
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -167,18 +167,3 @@ def test_a_package_of_your_own_adds_a_command(monkeypatch: Patch, capsys: Capsys
     mine = EntryPoints([EntryPoint("hello", "of_mine:HELLO", cli.GROUP)])
     monkeypatch.setattr(cli, "entry_points", lambda group: mine)
     assert shown(["hello", "you"], capsys) == "you\n"
-
-
-def test_a_package_of_your_own_adds_an_environment(monkeypatch: Patch, tmp_path: Path) -> None:
-    """It is found as ``importlib.metadata`` finds it; of two of one name, the first on the path."""
-    (tmp_path / "of_mine.py").write_text("class Place:\n    MINE = 'topics', 'mine', {}\n\nYOURS = 1\n")
-    for folder, place in (("1", "of_mine:Place.MINE"), ("2", "of_mine:YOURS")):
-        info = tmp_path / folder / "of_mine-1.0.dist-info"
-        info.mkdir(parents=True)
-        text = f"[other]\na = b:c\n\n[{packages.ENVIRONMENTS}]\n# mine\nmine/Mine-v0 = {place}\n\n[last]\nd = e:f\n"
-        (info / "entry_points.txt").write_text(text)
-    here = [str(tmp_path / folder) for folder in ("1", "2", "none")]
-    monkeypatch.setattr(sys, "path", [*here, str(tmp_path)])
-    assert packages.declared(packages.ENVIRONMENTS) == {"mine/Mine-v0": ("topics", "mine", {})}
-    found = importlib.metadata.entry_points(group=packages.ENVIRONMENTS)
-    assert {entry.name: entry.load() for entry in found} == packages.declared(packages.ENVIRONMENTS)

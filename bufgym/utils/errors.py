@@ -3,6 +3,7 @@
 ``except BufgymError`` catches every error that the caller can put right. Any other exception is a bug in bufgym.
 """
 
+import importlib.metadata
 from collections.abc import Iterable
 from os import PathLike
 
@@ -50,7 +51,7 @@ class TraceWarning(UserWarning):
 
 def unknown(what: str, name: object, known: Iterable[str], also: str = "", place: str = "") -> BufgymError:
     """The error for a name that is not among those ``known``: names the one that was meant, or all of them."""
-    import difflib  # not at start-up, as importlib.metadata below
+    import difflib  # not at start-up: few names are wrong
 
     names = list(known)
     close = difflib.get_close_matches(str(name), names, 1)
@@ -93,8 +94,6 @@ def install(extra: str) -> str:
 
     pip finds the extra in what is installed, so no package index needs to know bufgym.
     """
-    import importlib.metadata  # takes longer than all the rest of ``import bufgym``
-
     package, _, bracket = (extra if "[" in extra else f"bufgym[{extra}]").partition("[")
     try:
         importlib.metadata.version(package)

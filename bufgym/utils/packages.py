@@ -1,13 +1,7 @@
 """Packages beside bufgym: what each declares to add, and the message where the package is not installed."""
 
-import glob
-import importlib
-import sys
 import tomllib
 from collections.abc import Iterable
-from contextlib import suppress
-from operator import attrgetter
-from pathlib import Path
 from typing import Any, NoReturn
 
 from bufgym.utils.errors import BufgymError
@@ -15,24 +9,6 @@ from bufgym.utils.files import PACKAGE
 
 COMMANDS, ENVIRONMENTS = "bufgym.commands", "bufgym.environments"
 """Groups of entry points: what an installed package adds."""
-
-
-def declared(group: str) -> dict[str, Any]:
-    """Entry points of the group, by name, loaded; where two packages declare a name, the one that Python finds first.
-
-    ``importlib.metadata`` finds the same, and takes longer to import than all the rest of bufgym's start.
-    """
-    places: dict[str, str] = {}
-    for folder in sys.path:
-        for file in glob.iglob(f"{glob.escape(folder or '.')}/*-info/entry_points.txt"):
-            with suppress(OSError):
-                text = Path(file).read_text(encoding="utf-8", errors="replace")
-                for line in text.partition(f"[{group}]\n")[2].partition("\n[")[0].splitlines():
-                    name, is_entry, place = line.partition("=")
-                    if is_entry and name[0] not in "#;":
-                        places.setdefault(name.strip(), place.strip())
-    pairs = {name: place.partition(":") for name, place in places.items()}
-    return {name: attrgetter(what)(importlib.import_module(module)) for name, (module, _, what) in pairs.items()}
 
 
 def absent(group: str, installed: Iterable[str]) -> dict[str, str]:
