@@ -60,6 +60,8 @@ NEEDS = {
     "rclcpp": Need("ROS 2 in C++", by_hand="run .venv/bin/python .ci/rclcpp.py, which builds it (minutes, once)"),
     "rclcpp_build": Need("rclcpp's build", apt=("git", "g++", "cmake", "libtinyxml2-dev", "libconsole-bridge-dev")),
     "compiler": Need("C and C++ compilers", apt=("gcc", "g++", "clang", "cmake"), programs=_BUILD),
+    "zig": Need("zig's C compiler", pip=("ziglang==0.17.1",)),
+    "qemu": Need("programs for arm64", apt=("qemu-user",), programs=("qemu-aarch64",)),
     "tunnel": Need("links with a round trip", apt=("iproute2",), programs=("ip",)),
     "root": Need("links with a round trip", by_hand="run as root, with /dev/net/tun (docker run --privileged)"),
     "data": Need("recorded data", by_hand="set BUFGYM_SHARED_DATA to the folder of recordings"),
