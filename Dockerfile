@@ -10,5 +10,5 @@ RUN apt-get update \
 WORKDIR /bufgym
 COPY . .
 # Setting up is a rule of the Makefile; compiling beforehand spares every run half a minute.
-RUN make .venv/.ready && .venv/bin/bufgym warmup
+RUN make .venv/.ready
 CMD ["make", "train"]

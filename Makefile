@@ -30,7 +30,7 @@ help:
 	@echo "make docs     set up if needed, then build the site to build/site"
 	@echo "make gallery  set up if needed, then draw the films, the previews and the interactive page in docs/ again"
 	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
-	@echo "make dist     set up if needed, then build and check wheel and sdist in dist/"
+	@echo "make dist     set up if needed, then build and check wheels for Linux (x86_64, aarch64) and sdist in dist/"
 	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies"
 	@echo "make trainers    set up if needed, then run each program of docs/guide/trainers.md in a fresh environment (LIBRARY=skrl: one)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
@@ -78,10 +78,13 @@ tutorials: $(READY)
 	  (cd docs/tutorials && ../../$(BIN)/python $$(basename $$page)) || exit 1; done
 	rm -rf docs/tutorials/*.csv docs/tutorials/mine
 
+# The first builds the sdist, and its wheel from that. zig compiles both wheels, for a libc from 2012 on.
 dist: $(READY)
 	rm -rf dist
 	$(PIP) install --quiet -c constraints.txt -e ".[dist]"
-	for folder in . packages/*; do $(BIN)/python -m build --outdir dist $$folder || exit 1; done
+	BUFGYM_TARGET=x86_64-linux $(BIN)/python -m build --outdir dist .
+	BUFGYM_TARGET=aarch64-linux $(BIN)/python -m build --wheel --outdir dist .
+	for folder in packages/*; do $(BIN)/python -m build --outdir dist $$folder || exit 1; done
 	$(BIN)/python -m twine check --strict dist/*
 
 # Every Python that is here, each with the newest dependencies and with the oldest that pyproject allows.

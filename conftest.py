@@ -23,16 +23,13 @@ from needs import needs
 from recording_cases import recorded_data
 from registries import forgotten, restored
 
-from bufgym import jit
-
-jit.compile_silently()  # tests count lines on stderr
+from bufgym.jit import JIT
 
 REPO = Path(__file__).resolve().parent
-COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 
 # A busy machine draws examples slowly; that is no failure.
 patient = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
-few, many = (25, 200) if COMPILED else (8, 30)
+few, many = (25, 200) if JIT else (8, 30)
 settings.register_profile("commit", patient, max_examples=few, derandomize=True, database=None)
 settings.register_profile("nightly", patient, max_examples=many, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "commit"))

@@ -40,7 +40,7 @@ def _compiles(call: ast.Call) -> bool:
 
 
 def kernels(source: str) -> Iterator[ast.FunctionDef]:
-    """All functions of a module that Numba compiles."""
+    """All functions of a module that become C."""
     nodes = list(ast.walk(ast.parse(source)))
     compiled: set[str] = set()
     for node in nodes:

@@ -83,7 +83,7 @@ def pytest(
     """A stage of tests, on two workers of one thread each: more only make them wait for one another."""
     report = folder / f"{name.replace(' ', '-')}.xml"
     command = [PYTHON, "-m", "pytest", "-n", "2", f"--junitxml={report}", "-o", "junit_family=xunit1", *arguments]
-    settings = {"OMP_NUM_THREADS": "1", "NUMBA_DISABLE_JIT": str(int(not compiled)), **(environment or {})}
+    settings = {"OMP_NUM_THREADS": "1", "BUFGYM_KERNELS": "c" if compiled else "python", **(environment or {})}
     return Stage(name, command, limit_s, settings, report=report)
 
 

@@ -7,7 +7,7 @@ RUN pip install --no-cache-dir . "./packages/live[relay,mesh]" \
  && install -d -o relay /held /cache
 USER relay
 WORKDIR /held
-ENV NUMBA_CACHE_DIR=/cache PYTHONUNBUFFERED=1
+ENV BUFGYM_CACHE=/cache PYTHONUNBUFFERED=1
 EXPOSE 7420
 ENTRYPOINT ["bufgym", "relay"]
 CMD ["serve", "--config", "/etc/bufgym/relay.toml"]

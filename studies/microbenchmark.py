@@ -5,6 +5,7 @@ A step has one decision, an exact link, the next message, and all numbers of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -57,7 +58,7 @@ def _move(bare: Bare, i: int, action: int, capacity: int) -> None:
     s = state[QUEUED]
     if action < s:
         _close(bare, i, action + 1, s + 1)
-        gain[action + 1] = ONE - np.exp(-STEEP * (x[action + 1] - x[action]))
+        gain[action + 1] = ONE - math.exp(-STEEP * (x[action + 1] - x[action]))
     enqueues = action == capacity + 1 and s < capacity
     s += enqueues
     if action == 0 or (enqueues and s == 1):
@@ -72,8 +73,8 @@ def _move(bare: Bare, i: int, action: int, capacity: int) -> None:
     at_s[s + 1], size[s + 1] = np.float32(state[NOW_US]) * SECOND, np.float32(SIZE_BYTES)
     x[s + 1] = last[1] + STRIDE * np.float32(state[SEED] // 65536 % 8)
     at_s[s + 2], x[s + 2] = TWO * at_s[s + 1] - last[0], TWO * x[s + 1] - last[1]
-    gain[s + 1] = ONE - np.exp(-STEEP * (x[s + 1] - x[s]))
-    gain[s + 2] = ONE - np.exp(-STEEP * (x[s + 1] - last[1]))
+    gain[s + 1] = ONE - math.exp(-STEEP * (x[s + 1] - x[s]))
+    gain[s + 2] = ONE - math.exp(-STEEP * (x[s + 1] - last[1]))
     last[2] = KEPT * last[2] + (ONE - KEPT) * np.float32(state[LEFT])
 
 
@@ -89,8 +90,10 @@ def observe(bare: Bare, i: int, flat: Reals, mask: NDArray[np.int8]) -> None:
     at_s, x, size, gain = at[0], at[1], at[2], at[3]
     s, width, last = bare.state[i, QUEUED], mask.shape[1] - 1, bare.previous[i]
     even_s, even_x = (at_s[s + 1] - at_s[0]) / np.float32(width), (x[s + 1] - x[0]) / np.float32(width)
-    even, share = ONE - np.exp(-STEEP * even_x), ONE / np.float32(s + 1)
-    mean = size[1 : s + 2].sum() * share
+    even, share = np.float32(ONE - math.exp(-STEEP * even_x)), ONE / np.float32(s + 1)
+    mean = np.float32(0)
+    for k in range(s + 1):
+        mean += size[k + 1] * share
     for k in range(s + 1):
         lost = gain[k + 1] * gain[k + 2]
         out[k], out[width + k] = ONE, np.float32(k + 1) * share
@@ -110,8 +113,11 @@ def observe(bare: Bare, i: int, flat: Reals, mask: NDArray[np.int8]) -> None:
     context[4], context[5] = min(s, 1), left_us / (left_us + np.float32(PERIOD_US)) if s > 0 else 0
     context[6] = _squash(np.float32(now_us - bare.state[i, LEFT_US]), np.float32(width * PERIOD_US))
     context[7], context[8] = _squash(np.float32(bare.state[i, LEFT]), ONE), _squash(last[2], ONE)
-    context[9:], last[:2] = even, (at_s[s + 1], x[s + 1])
-    mask[i, :s], mask[i, s : width - 1], mask[i, width - 1], mask[i, width] = 1, 0, 1, s < width - 1
+    context[9:] = even
+    last[0], last[1] = at_s[s + 1], x[s + 1]
+    mask[i, :s] = 1
+    mask[i, s : width - 1] = 0
+    mask[i, width - 1], mask[i, width] = 1, s < width - 1
 
 
 @kernel

@@ -250,7 +250,7 @@ def report(figures: Sequence[Measurement], repeats: int) -> str:
     lines += ["", f"Best of {repeats} repeats each, in time of the processor (2 threads: in time that passed)."]
     lines.append("Actions drawn beforehand among the valid ones.")
     if not JIT:
-        lines.append("Compilation is off (NUMBA_DISABLE_JIT): these figures say nothing about bufgym's speed.")
+        lines.append("Compilation is off (BUFGYM_KERNELS): these figures say nothing about bufgym's speed.")
     definitions = {f.definition: f"- {f.name.split(',')[0]}: {f.definition}" for f in reversed(figures)}
     return "\n".join([*lines, *reversed(definitions.values())])
 
@@ -266,7 +266,7 @@ def _human(number: float) -> str:
 def write_json(figures: Sequence[Measurement], sizes: Sizes, path: Path) -> None:
     """Write figures, sizes, and the versions and machine they were measured on."""
     document = {
-        "versions": {name: version(name) for name in ("bufgym", "numpy", "numba", "gymnasium")},
+        "versions": {name: version(name) for name in ("bufgym", "numpy", "gymnasium")},
         "python": platform.python_version(),
         "machine": platform.machine(),
         "processors": os.cpu_count(),

@@ -29,7 +29,6 @@ NEEDED = {
 ELSEWHERE = {
     "studies.bounds": "studies/test_bounds.py",
     "studies.causal_planner": "studies/test_causal_planner.py",
-    "studies.compiling": "it compiles for minutes",
     "studies.coverage": "studies/test_coverage.py",
     "studies.fit": "studies/test_fit_page.py",
     "studies.fit_sizes": "studies/test_fit_sizes.py",

@@ -271,4 +271,4 @@ def copied(folder: Path, rows: Iterable[str], forgotten: Collection[str] = ()) -
 def surroundings(folder: Path) -> dict[str, str]:
     """The environment of a process that imports the copy in a folder, as plain Python."""
     places = os.pathsep.join(str(folder / name) for name in (".", "packages/live", "packages/papers"))
-    return {**os.environ, "PYTHONPATH": places, "NUMBA_DISABLE_JIT": "1", "MPLBACKEND": "agg"}
+    return {**os.environ, "PYTHONPATH": places, "BUFGYM_KERNELS": "python", "MPLBACKEND": "agg"}

@@ -71,7 +71,7 @@ NEEDS = {
     "systemd": Need("the unit of systemd", by_hand="apt-get install systemd", programs=("systemd-analyze",)),
     "git": Need("the checkout itself", by_hand="git clone, in place of an archive"),
     "system": Need("another operating system", by_hand="run them on Linux"),
-    "compiled": Need("compiled kernels", by_hand="unset NUMBA_DISABLE_JIT"),
+    "compiled": Need("compiled kernels", by_hand="unset BUFGYM_KERNELS"),
 }
 """Group -> what it is and how to have it."""
 

@@ -27,7 +27,6 @@ REGISTRIES = (
     "bufgym.scenario.registry:SCENARIOS",
     "bufgym.scenario.suites:SUITES",
     "bufgym.benchmark.tasks:TASKS",
-    "bufgym.benchmark.warmup:PARTS",
     "bufgym:ENVIRONMENTS",
     "gymnasium:registry",
     "bufgym.cli:COMMANDS",

@@ -8,7 +8,6 @@ line on stderr and exit code 2. Ctrl-C gives exit code 130.
 import contextlib
 import io
 import os
-import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -50,7 +49,6 @@ COMMANDS: dict[str, Any] = {
     "play": "bufgym.cli.play:play",
     "export": "bufgym.cli.export:export",
     "dataset": ("Record data sets for imitation and offline learning.", {"make": "bufgym.cli.dataset:dataset"}),
-    "warmup": "bufgym.cli.results:warmup",
 }
 """The core's commands in the order of ``--help``: where the function is, or (purpose, commands below it)."""
 
@@ -135,8 +133,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         place = modules.line_of(error)
         if place is not None:
             return _failed(f"{place}: {type(error).__name__}: {error}")
-        if modules.FILES and type(error).__module__.startswith("numba."):
-            return _failed(f"{modules.FILES[-1]}: a policy with compile=True that Numba cannot compile: {_gist(error)}")
         raise
     return code or 0
 
@@ -179,14 +175,3 @@ def _missing(error: MissingArgumentError) -> str:
     if argument is None or argument.tokens or error.keyword is not None:
         return str(error)
     return f"{' '.join(error.command_chain or ('bufgym',))} needs {argument.name}"
-
-
-def _gist(error: Exception) -> str:
-    """Extract from Numba's long message the construct that it could not compile and the source line."""
-    plain = re.sub(r"\x1b\[[\d;]*m", "", str(error))
-    lines = [line.strip() for line in plain.splitlines() if line.strip()]
-    # The message ends with "File "mine.py", line 4:".
-    place = [line.rstrip(":") for line in lines if line.startswith("File ")][-1:]
-    reason = [line for line in lines if not line.startswith(("Failed in", "During:", "File ", "-", "^", "<"))][:1]
-    # The full type of a buffer has some twenty fields.
-    return re.sub(r"\bBuffer\(.*\)", "Buffer", "; ".join([*reason, *place]))

@@ -1,4 +1,4 @@
-"""``bufgym report``, ``leaderboard``, ``validate`` and ``warmup``."""
+"""``bufgym report``, ``leaderboard`` and ``validate``."""
 
 from pathlib import Path
 from typing import Annotated
@@ -67,27 +67,3 @@ def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None
     print(f"{entry.name}: holds")
     for key, (stated, low, high) in entry.values.items():
         print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {file}")
-
-
-def warmup() -> None:
-    """Compile beforehand what environments and benchmarks need."""
-    import os
-    import time
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-    from multiprocessing import get_context
-
-    from bufgym import jit
-    from bufgym.benchmark import warmup as compiling
-    from bufgym.utils.processes import end_with
-
-    if not jit.JIT:
-        print("compilation is off (NUMBA_DISABLE_JIT): nothing to do")
-        return
-    began_s = time.perf_counter()
-    print(f"compiling {len(compiling.PARTS)} parts: {', '.join(compiling.PARTS)}", flush=True)
-    # A process for each core. Code that two of them need is compiled twice, with equal results.
-    with ProcessPoolExecutor(None, get_context("spawn"), end_with, (os.getpid(),)) as processes:
-        parts = {processes.submit(compiling.compile_part, what): what for what in compiling.PARTS}
-        for number, part in enumerate(as_completed(parts), 1):
-            print(f"{number}/{len(parts)} {parts[part]}: {part.result():.1f} s", flush=True)
-    print(f"ready after {time.perf_counter() - began_s:.0f} s; compiled code is in {jit.FOLDER}")

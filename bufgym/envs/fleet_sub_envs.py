@@ -1,6 +1,6 @@
 """Sub-environments whose senders are the robots of cells, and the batch of them from which one shared policy learns."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +10,7 @@ from bufgym.envs.options import SLOTS, Options, read_arguments
 from bufgym.envs.step import step_cells
 from bufgym.envs.sub_envs import SubEnvs
 from bufgym.envs.vector import SenderVectorEnv
+from bufgym.jit import Repeated
 from bufgym.model.checks import whole
 from bufgym.scenario import FleetScenario, Uplink
 from bufgym.sim.cell import Fleet
@@ -36,6 +37,7 @@ class FleetSubEnvs(SubEnvs):
         self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
         self._threads = Threads(np.arange(cells), options.num_threads)
+        self._again = [Repeated() for _ in self._threads.parts]
 
     def seed(self, i: int, rng: np.random.Generator) -> None:
         """Give robot ``i`` streams of its own if it is the first of its cell; the others need none."""
@@ -59,8 +61,17 @@ class FleetSubEnvs(SubEnvs):
             self.fleet.load(c, episode)
         return cells
 
-    def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_cells(self.senders.batch, self.fleet.shares, rows, actions, self.rewarded, self.output, self.form.named)
+    def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
+        call(
+            step_cells,
+            self.senders.batch,
+            self.fleet.shares,
+            rows,
+            actions,
+            self.rewarded,
+            self.output,
+            self.form.named,
+        )
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: each robot's own weighted sum, or for a "team" the mean within its cell."""

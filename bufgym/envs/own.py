@@ -6,21 +6,21 @@ Other functions run in ordinary Python. Row i of a batch and the single environm
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.output import StepOutput
 from bufgym.jit import compile_signature, kernel, named, unchecked_at, unchecked_slice
+from bufgym.kernels.kinds import BOOL, FLOAT, INT, KernelError, Pointer, Tuple, array_kind, record_kind
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import Field, OwnTerm
-from bufgym.policies.registry import view_type
+from bufgym.policies.registry import view_kind
 from bufgym.sim.rollout import python_arrival, python_view
-from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch, batch_type
+from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch
 from bufgym.sim.view import last_arrival, view
 from bufgym.utils.errors import BufgymError
 
@@ -65,6 +65,7 @@ class Step(NamedTuple):
     """float64[parameters], read-only: the term's settings, in the order of its registration."""
 
 
+@kernel
 def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
     """Write a slot field into the columns from ``first`` on, for each row that waits for a decision."""
     for i in range(len(batch.senders)):
@@ -78,6 +79,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
                 flat[i, first + sender.capacity] = function(buffer, arrival, sender.occupancy)
 
 
+@kernel
 def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
     """Write a context field likewise."""
     for i in range(len(batch.senders)):
@@ -161,6 +163,7 @@ def end_of_step(batch: Batch, i: int, ended: bool) -> int:
     return int(max(sender.now_us, last.transmitted_us + sender.propagation_us))
 
 
+@kernel
 def write_term(
     batch: Batch,
     function: Any,
@@ -231,50 +234,34 @@ def _read_only_step(*arguments: Any) -> Step:
 
 
 @functools.cache
-def _types() -> dict[str, Any]:
-    """Numba types used in the signatures here."""
-    types, message, log = cast(Any, numba.types), numba.from_dtype(MESSAGE), numba.from_dtype(LOG_ENTRY)
-    whole, constants = types.int64, types.Array(types.float64, 1, "C", readonly=True)
-    kinds = {
-        "messages": types.Array(message, 1, "C"),
-        "log": types.Array(log, 1, "C"),
-        "topics": types.Array(numba.from_dtype(TOPIC), 1, "C"),
-        "parameters": constants,
-        "ended": types.boolean,
-        **dict.fromkeys(("transmitted", "delivered"), types.Array(whole, 1, "C")),
+def pointers() -> dict[str, Pointer]:
+    """Kinds of the functions of fields and terms."""
+    whole, message, reals = array_kind(np.int64), record_kind(MESSAGE), array_kind(float)
+    kinds: dict[str, Any] = {
+        "messages": array_kind(MESSAGE),
+        "log": array_kind(LOG_ENTRY),
+        "topics": array_kind(TOPIC),
+        "parameters": array_kind(float, constant=True),
+        "ended": BOOL,
+        **dict.fromkeys(("transmitted", "delivered"), whole),
     }
-    step = types.NamedTuple(tuple(kinds.get(name, whole) for name in Step._fields), Step)
-    real, reals = types.float64, types.Array(types.float64, 1, "C")
+    step = Tuple(tuple(kinds.get(name, INT) for name in Step._fields), Step._fields, "Step")
     return {
-        "slot": real(view_type(), message, whole),
-        "context": real(view_type(), message),
-        "term": real(step, reals),
-        "constants": constants,
-        "flat": types.Array(types.float32, 2, "C"),
-        "marks": types.Array(whole, 2, "C"),
-        "flags": types.Array(types.boolean, 1, "C"),
-        "table": types.Array(real, 2, "C"),
+        "slot": Pointer((view_kind(), message, INT), FLOAT),
+        "context": Pointer((view_kind(), message), FLOAT),
+        "term": Pointer((step, reals), FLOAT),
     }
 
 
-@functools.cache
-def _writer(kind: str, several: bool) -> Any:
-    """The compiled loop that writes a "slot" or "context" field or a "term" of all rows."""
-    types, whole = _types(), cast(Any, numba.types).int64
-    rest = [whole, types["flat"]]
-    if kind == "term":
-        rest = [*(types[name] for name in ("marks", "flags", "table", "constants")), whole, types["table"]]
-    signature = numba.types.void(batch_type(several), cast(Any, numba.types).FunctionType(types[kind]), *rest)
-    loops: dict[str, Any] = {"slot": write_slots, "context": write_context, "term": write_term}
-    return compile_signature(signature, loops[kind])
+WRITERS: dict[str, Any] = {"slot": write_slots, "context": write_context, "term": write_term}
+"""Kind of function -> the loop that calls it for all rows."""
 
 
 def _compiled(what: str, kind: str, own: Field | OwnTerm) -> Callable[..., None]:
-    """The loop of ``_writer`` over this field's or term's function."""
+    """The loop that writes a "slot" or "context" field or a "term" of all rows."""
     try:
-        function = compile_signature(_types()[kind], own.function)
-    except cast(Any, numba).core.errors.NumbaError as error:
-        reason = " ".join(str(error).split())
+        function = compile_signature(pointers()[kind], own.function)
+    except KernelError as error:
         rule = "leave out compile=True, and it runs as plain Python"
-        raise BufgymError(f"{what} {own.name!r}: Numba cannot compile it; {rule}: {reason[-300:]}") from None
-    return lambda batch, *rest: _writer(kind, bool(batch.several))(batch, function, *rest)
+        raise BufgymError(f"{what} {own.name!r}: is no kernel: {error}; {rule}") from None
+    return lambda batch, *rest: WRITERS[kind](batch, function, *rest)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
 from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
-from bufgym.jit import kernel, prefetch, without_dispatch
+from bufgym.jit import kernel, prefetch
 from bufgym.model.buffer import HOLD
 from bufgym.model.observe import Chosen
 from bufgym.sim.decisions import answer_send, decide
@@ -32,7 +32,6 @@ def advance(batch: Batch, i: int) -> None:
     settle_gains(batch, i, event == END)
 
 
-@without_dispatch
 @kernel
 def step_rows(
     batch: Batch,
@@ -47,8 +46,7 @@ def step_rows(
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
     begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is
-    None where actions are no candidates, ``chosen`` where no built-in fields are named. Numba compiles each case
-    separately.
+    None where actions are no candidates, ``chosen`` where no built-in fields are named.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -104,7 +102,6 @@ def decisions_due(batch: Batch, shares: Shares, c: int) -> bool:
     return due
 
 
-@without_dispatch
 @kernel
 def step_cells(
     batch: Batch,

@@ -21,6 +21,7 @@ from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.regret import Regret
 from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
+from bufgym.jit import Repeated
 from bufgym.model.observe import (
     BUILT_IN,
     CANDIDATE_FIELDS,
@@ -85,6 +86,8 @@ class SubEnvs:
         if options.pool is not None:
             self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
+        self._again = [Repeated() for _ in self._threads.parts]
+        self._actions = np.zeros(n, np.int64)
 
         self.choices = None
         self.actions_count = self.capacity + 2
@@ -169,7 +172,7 @@ class SubEnvs:
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
-        self._run(self._load(rows, episodes), NO_ACTIONS)
+        self._run(self._again[0], self._load(rows, episodes), NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             if self._regret is not None:
@@ -178,10 +181,8 @@ class SubEnvs:
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every sub-environment; the result is in ``self.output``."""
-        if (rows := self._threads.all) is not None:
-            self._run(rows, actions)
-        else:
-            self._threads.each(lambda numbers: self._run(numbers, actions))
+        self._actions[:] = actions
+        self._threads.each(lambda part, rows: self._run(self._again[part], rows, self._actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
             if self._regret is not None:
@@ -212,8 +213,8 @@ class SubEnvs:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         return rows
 
-    def _run(self, rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        step_rows(self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)
+    def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
+        call(step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

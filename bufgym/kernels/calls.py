@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.jit import arrays
 from bufgym.kernels.kinds import BOOL, FLOAT, INT, NONE, SINGLE, Array, Given, Number, Pointer, Tuple, joined
 from bufgym.kernels.scope import OF_C, Value, name_in_c
 from bufgym.kernels.source import plain
@@ -18,6 +17,7 @@ _CASTS: dict[Any, Any] = {
     float: FLOAT, int: INT, bool: BOOL, np.float64: FLOAT, np.float32: SINGLE,
     **dict.fromkeys((np.int64, np.int32, np.uint64), INT),
 }  # fmt: skip
+_UNCHECKED = ("unchecked_item", "unchecked_at", "unchecked_slice", "unchecked_table", "prefetch")
 _FIELD_KINDS = {"float": FLOAT, "int": INT, "bool": BOOL, float: FLOAT, int: INT, bool: BOOL}
 
 
@@ -35,6 +35,8 @@ class Calls(Subscripts):
             return self.called(node, value)
         function = plain(self.found(node.func))
         make = _BUILT_IN.get(function) if getattr(function, "__hash__", None) else None
+        if getattr(function, "__module__", "") == "bufgym.jit.arrays" and function.__name__ in _UNCHECKED:
+            make = Calls.unchecked
         if make is not None:
             return make(self, node)
         if getattr(function, "__module__", "") == "math" and function.__name__ in OF_C:
@@ -85,6 +87,8 @@ class Calls(Subscripts):
         """A call of another kernel, or of a named tuple's class."""
         fields = getattr(function, "_fields", None)
         if fields is None and not hasattr(function, "__code__"):
+            if getattr(function, "__name__", "") in OF_C:
+                raise self.refused(node, f"write math.{function.__name__} for {ast.unparse(node.func)}")
             raise self.refused(node, f"{ast.unparse(node.func)}(...) is not part of the kernel language")
         arguments = {name: self.ex(argument) for name, argument in self.by_name(node, function).items()}
         before, values = self.in_order(list(arguments.values()))
@@ -207,7 +211,5 @@ _BUILT_IN: dict[Any, Callable[[Any, ast.Call], Value]] = {
     math.isinf: Calls.tested_number,
     math.isfinite: Calls.tested_number,
     **dict.fromkeys(_CASTS, Calls.converted),
-    **{getattr(arrays, name): Calls.unchecked for name in ("unchecked_item", "unchecked_at", "unchecked_slice",
-                                                           "unchecked_table", "prefetch")},
 }  # fmt: skip
 """Functions of Python that have C of their own."""

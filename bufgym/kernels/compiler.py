@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -109,6 +108,8 @@ class Compiler:
 
         Raises BufgymError: the first errors that the compiler found.
         """
+        from concurrent.futures import ThreadPoolExecutor  # imports logging; most processes compile nothing
+
         usual = [*self._flags(target), *flags]
         # Linked to a name of its own: macOS and Windows write the name into the file.
         with tempfile.TemporaryDirectory(prefix="bufgym-cc-") as name, ThreadPoolExecutor(_workers()) as pool:

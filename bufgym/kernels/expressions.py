@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bufgym.kernels.calls import Calls
-from bufgym.kernels.kinds import BOOL, FLOAT, INT, NONE, SINGLE, Given, Number, Record, Text, Tuple, joined
+from bufgym.kernels.kinds import BOOL, FLOAT, INT, NONE, SINGLE, Array, Given, Number, Record, Text, Tuple, joined
 from bufgym.kernels.scope import NotYetError, Value, name_in_c
 from bufgym.kernels.source import plain
 from bufgym.kernels.subscripts import Subscripts
@@ -93,6 +93,11 @@ class Expressions(Calls, Subscripts):
             return self.widened(Value(f"{owner.closed}->{name_in_c(node.attr)}", owner.kind.kind_of(node.attr)))
         if isinstance(owner.kind, Tuple) and node.attr in owner.kind.names:
             return self.member(owner, owner.kind.names.index(node.attr))
+        if isinstance(owner.kind, Array) and node.attr == "shape":
+            before, array = self.fixed(owner)
+            kind = Tuple((INT,) * owner.kind.axes)
+            lengths = [f"{array.closed}.n{axis}" for axis in range(owner.kind.axes)]
+            return Value(self.after(before, self.made(kind, lengths)), kind)
         raise self.refused(node, f"{ast.unparse(node.value)} has no {node.attr!r} in kernels")
 
     def ex_Tuple(self, node: ast.Tuple) -> Value:

@@ -150,6 +150,10 @@ class Program:
             call = f"return {made.cast(Value(call, made.result), pointer.result)}"
         self._texts.append(f"EXPORT {result} {symbol}({', '.join(heads)})\n{{\n    {call};\n}}\n")
 
+    def text(self, more: str) -> None:
+        """Add a declaration."""
+        self._texts.append(more)
+
     def source(self) -> str:
         """The whole program."""
         head = "#define BG_CHECKED\n" * self.checked

@@ -40,7 +40,7 @@ def tree_of(function: FunctionType) -> ast.FunctionDef:
         raise KernelError(f"{function.__qualname__}: its source is not there to read")
     found = _functions(code.co_filename, text).get((code.co_name, code.co_firstlineno), [])
     fitting = [node for node in found if _fits(node, code)]
-    if not fitting:
+    if not fitting or _meaning(code) not in _meanings(code.co_filename, text):
         raise KernelError(f"{code.co_filename}: has changed since {function.__qualname__} was imported; start again")
     node = fitting[0]
     if isinstance(node, ast.FunctionDef):
@@ -48,6 +48,23 @@ def tree_of(function: FunctionType) -> ast.FunctionDef:
     body = ast.copy_location(ast.Return(node.body), node.body)
     made = ast.FunctionDef("field", node.args, [body], [])
     return ast.copy_location(made, node)
+
+
+def _meaning(code: CodeType) -> Any:
+    """What a function computes: its name, place, instructions and constants."""
+    constants = [constant for constant in code.co_consts if not isinstance(constant, CodeType)]
+    return code.co_name, code.co_firstlineno, code.co_code, repr(constants)
+
+
+@functools.cache
+def _meanings(file: str, text: str) -> set[Any]:
+    """Those of all functions of a file, as it is now."""
+    found, waiting = set(), [compile(text, file, "exec", dont_inherit=True)]
+    while waiting:
+        code = waiting.pop()
+        found.add(_meaning(code))
+        waiting += [inner for inner in code.co_consts if isinstance(inner, CodeType)]
+    return found
 
 
 def _fits(node: Any, code: CodeType) -> bool:

@@ -115,6 +115,8 @@ class Subscripts(Scope):
         indices = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(indices) > owner.kind.axes:
             raise self.refused(node, f"{ast.unparse(node.value)} has {owner.kind.axes} axes")
+        while len(indices) > 1 and isinstance(indices[-1], ast.Slice) and ast.unparse(indices[-1]) == ":":
+            indices = indices[:-1]  # all of an axis
         *fore, last = indices
         if any(isinstance(index, ast.Slice) for index in fore):
             raise self.refused(node, "only the last index may be a slice: write a loop")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import FOLDER
+from bufgym.jit.folder import FOLDER
 from bufgym.utils.files import PACKAGE, replaced
 
 SOURCES = (
@@ -36,8 +36,6 @@ def cached(inputs: tuple[Any, ...], messages: int, find: Callable[[], Found]) ->
 
     A file that is missing or damaged is made anew. Where none can be written, nothing is cached.
     """
-    if not FOLDER:
-        return find()
     bytes_of = [one.tobytes() if isinstance(one, np.ndarray) else repr(one).encode() for one in inputs]
     name = hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in bytes_of)).hexdigest()[:32]
     file = Path(FOLDER).parent / "plans" / sources() / name

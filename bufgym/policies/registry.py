@@ -26,7 +26,8 @@ from typing import Any, NamedTuple, cast, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import JIT, compile_signature
+from bufgym.jit import compile_signature
+from bufgym.kernels.kinds import BOOL, FLOAT, INT, Pointer, Tuple, array_kind, record_kind
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.checks import changed, check_name, constants
 from bufgym.utils.errors import BufgymError, unknown
@@ -112,7 +113,7 @@ class Policy:
     about: str = ""
     """A sentence on its rule; empty to take the first line of ``on_arrival``'s docstring."""
     compile: bool = False
-    """Promises that Numba can compile its functions; otherwise they run as ordinary Python."""
+    """Promises that its functions are kernels; otherwise they run as ordinary Python."""
     unbounded: bool = False
     """Whether its queue grows without limit, whatever L is; bounds for L messages do not hold for it."""
     privileged: Privileged | None = None
@@ -214,38 +215,28 @@ def _compiled(*functions: Any) -> Functions:
     A function that is a kernel already is compiled again from its text, for the one signature.
     """
     plain = [getattr(function, "py_func", function) for function in functions]
-    return cast(Functions, tuple(map(compile_signature, signatures(), plain)) if JIT else functions)
+    return cast(Functions, tuple(map(compile_signature, signatures(), plain)))
 
 
 @functools.cache
-def view_type() -> Any:
-    """Numba's type of a ``Buffer``."""
-    import numba
-
-    real = numba.types.float64
-    constants = numba.types.Array(real, 1, "C", readonly=True)
-    types = {
-        "slots": numba.types.Array(numba.from_dtype(MESSAGE), 1, "C"),
-        "v": constants,
-        "parameters": constants,
-        "topics": numba.types.Array(numba.from_dtype(TOPIC), 1, "C"),
-        **{name: real for name, kind in get_type_hints(Buffer).items() if kind is float},
-    }
-    return cast(Any, numba).types.NamedTuple([types.get(name, numba.types.int64) for name in Buffer._fields], Buffer)
+def view_kind() -> Tuple:
+    """The kind of a ``Buffer``."""
+    constants = array_kind(float, constant=True)
+    kinds: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants}
+    kinds |= {"topics": array_kind(TOPIC)}
+    kinds |= {name: FLOAT for name, kind in get_type_hints(Buffer).items() if kind is float}
+    return Tuple(tuple(kinds.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")
 
 
 @functools.cache
-def signatures() -> tuple[Any, Any, Any, Any]:
-    """Numba types of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
-    import numba
-
-    int_, view, message = numba.types.int64, view_type(), numba.from_dtype(MESSAGE)
-    reals = numba.types.Array(numba.types.float64, 1, "C")
+def signatures() -> tuple[Pointer, Pointer, Pointer, Pointer]:
+    """Kinds of ``on_arrival``, ``on_departure``, ``on_dequeue`` and ``on_send``."""
+    view, memory = view_kind(), array_kind(float)
     return (
-        int_(view, message, reals),
-        numba.types.void(view, reals),
-        numba.types.boolean(view, reals),
-        int_(view, reals),
+        Pointer((view, record_kind(MESSAGE), memory), INT),
+        Pointer((view, memory), None),
+        Pointer((view, memory), BOOL),
+        Pointer((view, memory), INT),
     )
 
 

@@ -1,6 +1,6 @@
 """A check after a run that a policy did not change the records of its sender.
 
-Compiled policies see the sender's own records, which spares a copy at every decision, but Numba lets them write there.
+Compiled policies see the sender's own records, which spares a copy at every decision, but they can write there.
 So every benchmark run is checked at its end: a policy that changed a message or a topic's rules has no result.
 """
 

@@ -4,31 +4,28 @@ Both run senders with links of their own (``shares`` is None) and robots that sh
 """
 
 import functools
-from contextlib import nullcontext, suppress
 from time import perf_counter
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import JIT, NotCachedError, cached_only, compile_signature, interruptible, kernel, named
+from bufgym.jit import JIT, interruptible, kernel, named
 from bufgym.model.buffer import Buffer
 from bufgym.model.link import FOREVER
-from bufgym.policies.registry import Policy, signatures
+from bufgym.policies.registry import Policy
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
-from bufgym.sim.shared_link import Shares, shares_type
+from bufgym.sim.shared_link import Shares
 from bufgym.sim.socket import credit
-from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch, batch_type
+from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, DEQUEUE, END, NOTHING, SEND, Batch
 from bufgym.sim.transition import move_on, next_event, sender_of
 from bufgym.sim.view import arrival_of, view
 from bufgym.utils.errors import BufgymError
 
-if JIT:
-    import numba
-
 _SHORT = 200_000  # Arrivals times numbers read at each, for a rollout that takes at most some milliseconds
 
 
+@kernel
 def rollout(
     batch: Batch,
     shares: Shares | None,
@@ -65,37 +62,20 @@ def rollout(
         credit(batch, i, FOREVER)
 
 
-@functools.cache
-def compiled_rollout(shared: bool, several: bool) -> Any:
-    """``rollout`` compiled once for every policy, as policies arrive as values of one function type.
-
-    ``shared``: the cells of a shared link, or senders with a link each. ``several``: several topics, or one queue.
-    """
-    if not JIT:
-        return rollout
-    functions = tuple(numba.types.FunctionType(signature) for signature in signatures())
-    memory = numba.types.Array(numba.types.float64, 2, "C")
-    shares = shares_type() if shared else numba.types.none
-    return compile_signature(
-        numba.types.void(batch_type(several), shares, memory, *functions, numba.types.boolean), rollout
-    )
-
-
 # In plain Python a view keeps its arrays alive; the kernel counts no references.
 _view = getattr(view, "py_func", view)
-_inlined: Any = kernel(rollout)
 
 
 @functools.cache
 def own_rollout(functions: Any, hears_departures: bool) -> Any:
-    """``rollout`` with a link each for one policy, of ``compiled`` functions: half the time, but seconds to compile."""
-    on_arrival, on_departure, on_dequeue, on_send = (kernel(function.py_func) for function in functions)
+    """``rollout`` with a link each for one policy, of ``compiled`` functions: quicker, but a second to compile."""
+    on_arrival, on_departure, on_dequeue, on_send = (function.py_func for function in functions)
 
+    @kernel
     def rollout_of(batch: Batch, memory: NDArray[np.float64]) -> None:
-        _inlined(batch, None, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
+        rollout(batch, None, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
 
-    rollout_of.__qualname__ = f"rollout_of_{functions[0].__qualname__}"  # it names the file of its code
-    return kernel(rollout_of)
+    return rollout_of
 
 
 def python_view(batch: Batch, i: int) -> Buffer:
@@ -152,19 +132,17 @@ def python_rollout(batch: Batch, shares: Shares | None, memory: NDArray[np.float
         credit(batch, i, FOREVER)
 
 
-_PAYS_IF_CACHED_S, _PAYS_S = 0.05, 2.0  # time in the shared rollout that earns a policy its own: if cached; always
+_PAYS_IF_READY_S, _PAYS_S = 0.05, 2.0  # time in the shared rollout that earns a policy its own: if made already; always
 _spent_s: dict[Any, float] = {}
 
 
-def choose_own(policy: Policy, spent_s: float, several: bool, memory: NDArray[np.float64]) -> Any:
+def choose_own(policy: Policy, spent_s: float, *arguments: Any) -> Any:
     """The policy's own rollout, if it pays after so many seconds in the one for all; else None."""
     # Compiling takes seconds, so a policy must have spent about as long; loading takes milliseconds.
-    if not JIT or spent_s <= _PAYS_IF_CACHED_S:
+    if not JIT or spent_s <= _PAYS_IF_READY_S:
         return None
-    with suppress(NotCachedError), cached_only() if spent_s < _PAYS_S else nullcontext():
-        kinds = batch_type(several), cast(Any, numba).typeof(memory)
-        return own_rollout(policy.compiled, policy.hears_departures).compile(kinds)
-    return None
+    own = own_rollout(policy.compiled, policy.hears_departures)
+    return own if own.code(arguments, ready=spent_s < _PAYS_S) else None
 
 
 def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], policy: Policy) -> None:
@@ -172,9 +150,9 @@ def roll_out(batch: Batch, shares: Shares | None, memory: NDArray[np.float64], p
     if not policy.compile:
         python_rollout(batch, shares, memory, policy)
         return
-    several, spent_s = bool(batch.several), _spent_s.get(policy.compiled, 0.0)
-    own = choose_own(policy, spent_s, several, memory) if shares is None else None
-    compiled = own or compiled_rollout(shares is not None, several)
+    spent_s = _spent_s.get(policy.compiled, 0.0)
+    own = choose_own(policy, spent_s, batch, memory) if shares is None else None
+    compiled: Any = own or rollout
     arguments = (batch, memory) if own else (batch, shares, memory, *policy.compiled, policy.hears_departures)
     began_s = perf_counter()
     # Its work at each arrival grows with its memory and the numbers it reads.

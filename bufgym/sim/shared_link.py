@@ -3,8 +3,7 @@
 See docs/methods.md, "A cell's link".
 """
 
-import functools
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +56,6 @@ def new_shares(cells: int, robots: int) -> Shares:
     """The arrays of so many cells with N = ``robots`` each."""
     numbers = np.zeros((cells, robots), np.int64)
     return Shares(records(cells, CELL), numbers, numbers.copy())
-
-
-@functools.cache
-def shares_type() -> Any:
-    """Numba's type of ``Shares``."""
-    import numba
-
-    return cast(Any, numba).typeof(new_shares(1, 1))
 
 
 @kernel

@@ -1,7 +1,6 @@
 """Arrays of a batch of senders, which the caller owns and the kernels change in place."""
 
-import functools
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +9,6 @@ from bufgym.jit import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER
-from bufgym.model.qoi import exponential
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 """Events of a sender (see the package's text)."""
@@ -176,14 +174,6 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
 def place_of(batch: Batch, i: int, message: Any) -> int:
     """Index of ``message`` in the log: its ``seq``, kept in range whatever a compiled policy wrote there."""
     return int(max(0, min(message.seq - batch.senders[i].first_seq, batch.senders[i].arrivals - 1)))
-
-
-@functools.cache
-def batch_type(several: bool) -> Any:
-    """Numba's type of a ``Batch`` of one queue each, or of several topics."""
-    import numba
-
-    return cast(Any, numba).typeof(new_batch(1, 1, 1, 2 if several else 1, exponential().array))
 
 
 def beginning(**settings: float) -> NDArray[np.int64]:

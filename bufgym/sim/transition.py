@@ -1,7 +1,7 @@
 """The transition: one function moves a sender, or the robots of a cell that share a link, on to the next event.
 
 ``shares`` tells the two cases apart. It is None if every sender has a link of its own; *cell* c is then sender c.
-Otherwise it holds the cells of ``bufgym.sim.shared_link``. Numba compiles each case separately.
+Otherwise it holds the cells of ``bufgym.sim.shared_link``. Each case is compiled separately.
 """
 
 from bufgym.jit import kernel, unchecked_at

@@ -21,17 +21,19 @@ class Threads:
         """``numbers``, int64[n], are rows or cells. They are split into at most ``num_threads`` parts."""
         parts = np.array_split(numbers, min(num_threads, len(numbers)))
         self.parts = [np.ascontiguousarray(part) for part in parts]
-        self.all = self.parts[0] if len(self.parts) == 1 else None
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
 
-    def each(self, work: Callable[[NDArray[np.int64]], None]) -> None:
-        """Call ``work`` on every part; return when all are done."""
+    def each(self, work: Callable[[int, NDArray[np.int64]], None]) -> None:
+        """Call ``work`` with every part's number and numbers; return when all are done."""
+        if len(self.parts) == 1:
+            work(0, self.parts[0])
+            return
         if self._pool is None or self._process != os.getpid():  # threads do not survive a fork
             from concurrent.futures import ThreadPoolExecutor  # not at start-up: most batches have one part
 
             self._pool, self._process = ThreadPoolExecutor(len(self.parts) - 1, "bufgym"), os.getpid()
-        running = [self._pool.submit(work, part) for part in self.parts[1:]]
-        work(self.parts[0])
+        running = [self._pool.submit(work, k, part) for k, part in enumerate(self.parts[1:], 1)]
+        work(0, self.parts[0])
         for part in running:
             part.result()

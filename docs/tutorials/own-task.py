@@ -43,7 +43,7 @@ class BetweenHalls:
 # ## A field
 #
 # A field is a function of the buffer and the arrival. This one is computed for each message; the newcomer is
-# `k = len(buffer.slots)`. `compile=True` promises that Numba can compile it.
+# `k = len(buffer.slots)`. `compile=True` promises that it can become C.
 
 # %%
 from bufgym.model.observe import field as observed

@@ -5,17 +5,13 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-from needs import needs
 from refusal_cases import refuse
 
 import bufgym.envs  # noqa: F401  (registers)
 from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.run import run
-from bufgym.benchmark.warmup import PARTS
-from bufgym.cli import main
 from bufgym.envs.expert import Player
-from bufgym.jit import FOLDER, JIT
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink
 from bufgym.scenario.numbered import draw
@@ -72,13 +68,3 @@ def test_a_player_refuses_a_decision_that_means_nothing() -> None:
         Player(odd).action(env.sub_envs.senders)
     for name, why in (("codel", "drops at dequeue"), ("rosbridge", "has an unbounded queue")):
         refuse(f"policy {name} {why}", Player, policies.get(name))
-
-
-@pytest.mark.nightly
-@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
-def test_each_part_is_named_and_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["warmup"]) == 0
-    printed = capsys.readouterr()
-    text = printed.out + printed.err
-    assert not [name for name in PARTS if f"/{len(PARTS)} {name}: " not in text]
-    assert FOLDER in text

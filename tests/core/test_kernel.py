@@ -1,6 +1,8 @@
-"""Where compiled code is cached: it rests on the sources as they are, and survives damage and a lack of room."""
+"""Kernels as Python calls them: what they take and give, and where their code is kept."""
 
+import copy
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -8,14 +10,16 @@ import threading
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import pytest
 from needs import needs
 from numpy.typing import NDArray
 
 from bufgym import jit
-from bufgym.jit import JIT, announce, interruptible, kernel, way, without_dispatch
+from bufgym.jit import JIT, Repeated, compile_signature, interruptible, kernel, records, way
+from bufgym.kernels import compiler
+from bufgym.kernels.kinds import FLOAT, INT, KernelError, Pointer, array_kind
+from bufgym.utils.errors import BufgymError
 
 TALE = """
 import os
@@ -28,9 +32,6 @@ def double(k):
 
 print(double(21))
 """
-
-PATIENT = "from bufgym.jit import announce as k; k.PATIENCE_S = 1e6"
-"""Beforehand: no notice, however long a busy machine takes to compile."""
 
 
 def run(tmp_path: Path, before: str = "", source: str = TALE, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -51,100 +52,174 @@ class Numbers(NamedTuple):
     several: bool | None = None
 
 
-needs_compilation = pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is cached without compilation"))
+CELL = np.dtype([("near", np.int64), ("far", np.float64)], align=True)
+needs_compilation = pytest.mark.skipif(
+    not JIT or compiler.find() is None, reason=needs("compiler", "nothing is compiled here")
+)
 
 
-@pytest.fixture(params=[way.PIPELINE, way.PLAIN])
-def each_compiler(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes of the test compile in each of the two ways."""
-    monkeypatch.setenv(way.VARIABLE, request.param)
+# ---------------------------------------------------------------- what a kernel takes and gives
+
+
+@kernel
+def told(whole: int, real: float, yes: bool, numbers: Numbers, cell: Any, nothing: Any = None) -> tuple[int, float]:
+    """All kinds of arguments."""
+    n = whole * len(numbers.of) + (1 if yes else 0)
+    if numbers.several is not None:
+        n += 100
+    if nothing is not None:
+        n += 1000
+    cell.near, cell.far = n, real
+    return n, real + numbers.of[0]
+
+
+def test_arguments_of_all_kinds() -> None:
+    cells, of = records(2, CELL), np.array([0.5, 2.0])
+    assert told(3, 2, True, Numbers(of), cells[1]) == (7, 2.5)  # 2 for a float: as annotated
+    assert cells["near"].tolist() == [0, 7] and cells["far"].tolist() == [0, 2]
+    assert told(np.int64(3), np.float64(1), np.bool_(False), Numbers(of, True), cells[0], 5) == (1106, 1.5)
+    assert told(cell=cells[0], whole=1, real=0.0, yes=False, numbers=Numbers(of)) == (2, 0.5)
 
 
 @needs_compilation
-@pytest.mark.usefixtures("each_compiler")
+def test_what_no_kernel_takes_is_named() -> None:
+    with pytest.raises(KernelError, match=r"^a kernel takes no str: numbers, arrays, records, tuples and functions$"):
+        told("3", 2.0, True, Numbers(np.zeros(1)), records(1, CELL)[0])
+    with pytest.raises(KernelError, match=r"^an array is of complex128: kernels know whole numbers and floats$"):
+        told(3, 2.0, True, Numbers(np.zeros(1, complex)), records(1, CELL)[0])
+
+
+@kernel
+def shift(numbers: NDArray[np.float64], by: float) -> None:
+    """Add to every number."""
+    for k in range(len(numbers)):
+        numbers[k] += by
+
+
+def test_numbers_that_do_not_lie_side_by_side_are_changed_too() -> None:
+    table, cells = np.zeros((3, 2)), records(3, CELL)
+    shift(table[:, 1], 2.0)
+    shift(cells["far"], 1.0)
+    assert table.tolist() == [[0, 2]] * 3
+    assert cells["far"].tolist() == [1, 1, 1] and cells["near"].tolist() == [0, 0, 0]
+
+
+def test_a_repeated_call_is_the_call_whichever_argument_changes() -> None:
+    again, one, other = Repeated(), np.zeros(2), np.zeros(3)
+    for _ in range(3):
+        again(shift, one, 1.0)
+    again(shift, other, 1.0)
+    again(shift, one, 0.5)
+    again(shift, np.zeros((2, 2))[:, 0], 7.0)
+    copy.deepcopy(again)(shift, other, 2.0)
+    pickle.loads(pickle.dumps(again))(shift, other, 2.0)
+    again(told, 1, 2.0, True, Numbers(one), records(1, CELL)[0])
+    assert one.tolist() == [3.5, 3.5] and other.tolist() == [5, 5, 5]
+
+
+@kernel
+def sum_of(function: Any, numbers: NDArray[np.float64]) -> float:
+    """Sum of a function's values."""
+    total = 0.0
+    for x in numbers:
+        total += function(x)
+    return total
+
+
+def square(x: float) -> float:
+    """x^2."""
+    return x * x
+
+
+def test_a_function_is_handed_over_at_run_time_or_is_part_of_the_code() -> None:
+    numbers = np.array([1.0, 2.0, 3.0])
+    assert sum_of(compile_signature(Pointer((FLOAT,), FLOAT), square), numbers) == 14
+    assert sum_of(square, numbers) == 14
+
+
+@needs_compilation
+def test_a_function_of_other_kinds_is_refused() -> None:
+    with pytest.raises(KernelError, match=r"kernel shift: must return a number"):
+        compile_signature(Pointer((array_kind(float), FLOAT), INT), shift)
+
+
+@needs_compilation
+def test_a_checked_kernel_names_the_line_of_python(tmp_path: Path) -> None:
+    source = TALE.replace("print(double(21))", "import numpy as np\n@kernel\ndef last(a):\n    return a[len(a)]\n"
+                          "print(2 * double(10) + 2)\nlast(np.zeros(3))")  # fmt: skip
+    file = tmp_path / "tale.py"
+    file.write_text(source.format(before=""))
+    environment = {**os.environ, "BUFGYM_KERNELS": "checked"}
+    done = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "42\n"
+    assert f"{file}:13: index outside an array of so many (3, 3)" in done.stderr
+
+
+def test_the_way_is_one_of_three() -> None:
+    assert [way.way(asked) for asked in ("", "c", "checked", "python")] == ["c", "c", "checked", "python"]
+    with pytest.raises(BufgymError, match=r"^BUFGYM_KERNELS: unknown way 'pyton'; did you mean 'python'\?$"):
+        way.way("pyton")
+
+
+# ---------------------------------------------------------------- where code is kept
+
+
+def kept(folder: Path) -> list[Path]:
+    """Files of code."""
+    return [file for file in folder.rglob("*bufgym_double*") if file.suffix != ".sum"]
+
+
+@needs_compilation
 @pytest.mark.parametrize("left", [0.0, 0.5], ids=["empty", "half"])
 def test_damaged_code_is_compiled_anew(tmp_path: Path, left: float) -> None:
-    run(tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "code"))
-    (file,) = (tmp_path / "code").rglob("*.nbc")
+    code = tmp_path / "code"
+    run(tmp_path, BUFGYM_CACHE=str(code))
+    (file,) = kept(code)
     whole = file.read_bytes()
     file.write_bytes(whole[: int(left * len(whole))])
-    assert run(tmp_path, before=PATIENT, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
-    assert len(file.read_bytes()) >= len(whole) - 8
-
-
-@needs_compilation
-@pytest.mark.usefixtures("each_compiler")
-def test_long_compiling_is_announced_once_and_code_from_the_cache_never(tmp_path: Path) -> None:
-    impatient = "from bufgym.jit import announce as k; k.PATIENCE_S = 0.0"
-    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == announce.NOTICE + "\n"
-    assert run(tmp_path, before=impatient, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
-
-
-@needs_compilation
-@pytest.mark.usefixtures("each_compiler")
-@pytest.mark.parametrize(
-    "before",
-    [PATIENT, "from bufgym.jit import announce as k; k.PATIENCE_S = 0.0; k.compile_silently()"],
-    ids=["quick", "silent"],
-)
-def test_what_is_not_announced(tmp_path: Path, before: str) -> None:
-    assert run(tmp_path, before=before, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
-
-
-@needs_compilation
-@pytest.mark.usefixtures("each_compiler")
-def test_who_wants_only_what_is_kept_compiles_nothing(tmp_path: Path) -> None:
-    asked = """
-import sys
-from bufgym.jit import NotCachedError, cached_only
-try:
-    with cached_only():
-        print(double(21))
-except NotCachedError:
-    print(double(21))
-    print("compiled", file=sys.stderr)
-"""
-    source = TALE.replace("print(double(21))", asked)
-    assert run(tmp_path, before=PATIENT, source=source, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == "compiled\n"
-    assert run(tmp_path, before=PATIENT, source=source, NUMBA_CACHE_DIR=str(tmp_path / "code")).stderr == ""
+    assert run(tmp_path, BUFGYM_CACHE=str(code)).stderr == ""
+    assert len(file.read_bytes()) == len(whole)
 
 
 @needs_compilation
 def test_where_no_folder_can_be_written_a_temporary_one_serves(tmp_path: Path) -> None:
-    nowhere = f"import os; os.environ.pop('NUMBA_CACHE_DIR', None); os.access = lambda *_: False; {PATIENT}"
+    nowhere = "import os; os.environ.pop('BUFGYM_CACHE', None); os.access = lambda path, mode, **_: mode != os.W_OK"
     done = run(tmp_path, before=nowhere, TMPDIR=str(tmp_path))
-    assert done.stderr.startswith("bufgym: compiled code cannot be cached")
+    assert done.stderr.startswith("bufgym: compiled code cannot be kept")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.glob("bufgym-*"))  # removed at the end
 
 
 @needs_compilation
-@pytest.mark.usefixtures("each_compiler")
 def test_a_full_disk_keeps_no_code(tmp_path: Path) -> None:
-    """Python's own way to replace a file fails, as both compilers write whole files or none."""
-    full = "import os\ndef full(*_): raise OSError(28, 'no space left')\nos.replace = full\n"
-    run(tmp_path, before=full + PATIENT, NUMBA_CACHE_DIR=str(tmp_path / "code"))
-    assert not list((tmp_path / "code").rglob("*.nbc"))
+    full = (
+        "import os\nreal = os.replace\ndef full(one, other):\n    if 'code' in str(other): raise OSError(28, 'full')\n"
+    )
+    full += "    return real(one, other)\nos.replace = full\n"
+    assert run(tmp_path, before=full, BUFGYM_CACHE=str(tmp_path / "code")).stderr == ""
+    assert not kept(tmp_path / "code")
+
+
+def test_without_a_compiler_a_kernel_runs_as_python_and_one_line_says_so(tmp_path: Path) -> None:
+    """Others that it calls do too, and the line says what brings a compiler."""
+    hidden = "from bufgym.kernels import compiler; compiler.on_path = compiler.zig = lambda: None"
+    source = TALE.replace("print(double(21))", "@kernel\ndef twice(k):\n    return double(k) + 0\n\nprint(twice(21))")
+    done = run(tmp_path, before=hidden, source=source, BUFGYM_CACHE=str(tmp_path / "code"), CC="")
+    said = "bufgym: no C compiler: twice runs as plain Python, much slower; install a C compiler"
+    assert done.stderr.startswith(said) if JIT else done.stderr == ""
+    assert done.stderr.count("\n") == int(JIT)
 
 
 @needs_compilation
-def test_a_direct_call_is_the_call() -> None:
-    """Rows are stepped without a look at the types of their arrays: by the code that Numba would have found."""
-
-    @kernel
-    def double(numbers: Numbers, factor: Any, more: Any) -> None:
-        for k in range(len(numbers.of)):
-            numbers.of[k] *= 2 * factor + more
-            if numbers.several is not None:
-                numbers.of[k] += 1
-
-    one, directly = np.arange(12.0), without_dispatch(double)
-    several = one.copy()
-    for _ in range(3):
-        directly(Numbers(one), 0.5, 1)
-        directly(Numbers(several, True), 0.5, 1)
-    assert one[:4].tolist() == [0, 8, 16, 24] and several[:4].tolist() == [7, 15, 23, 31]
-    assert len(double.overloads) == 2  # type: ignore[attr-defined]
+def test_a_file_that_changed_since_it_was_imported_is_not_compiled(tmp_path: Path) -> None:
+    """Its text would not be that of the function which Python runs."""
+    change = "open(__file__, 'a').close(); text = open(__file__).read()\nopen(__file__, 'w').write({})\n"
+    source = TALE.replace("print(double(21))", change.format("text.replace('k + k', 'k * k')") + "print(double(21))")
+    file = tmp_path / "tale.py"
+    file.write_text(source.format(before=""))
+    done = subprocess.run([sys.executable, str(file)], capture_output=True, text=True, check=False,
+                          env={**os.environ, "BUFGYM_CACHE": str(tmp_path)})  # fmt: skip
+    assert "tale.py: has changed since double was imported; start again" in done.stderr
 
 
 @needs_compilation
@@ -160,11 +235,10 @@ def test_a_branch_that_needs_a_missing_field_is_not_compiled() -> None:
         return inner(numbers)
 
     assert outer(Numbers(np.zeros(3))) == 3
-    with pytest.raises(numba.core.errors.TypingError):
+    with pytest.raises(KernelError, match="SetComp is not part of the kernel language"):
         outer(Numbers(np.zeros(3), True))
 
 
-@needs_compilation
 def test_a_named_tuple_made_in_a_kernel_is_handed_on() -> None:
     """Its fields stay as they were when it was made, the arrays that they name do not."""
 
@@ -185,6 +259,7 @@ def test_a_named_tuple_made_in_a_kernel_is_handed_on() -> None:
 # Ctrl-C is answered within a second while a kernel works, and what a kernel's thread raises arrives.
 
 LONG = """
+import math
 import signal
 
 import numpy as np
@@ -207,7 +282,7 @@ def episode(n, bytes_per_s):
 def far(buffer, arrival, memory):
     least = 0.0
     for k in range(20_000_000):
-        least += np.sin(memory[0] + k)
+        least += math.sin(memory[0] + k)
     return -1 if least < 0 else -2
 
 

@@ -103,7 +103,7 @@ def test_a_rollout_of_its_own_does_the_same(monkeypatch):
     for name in ("afr", "codel"):
         logs = []
         for pays_s in (np.inf, -1.0):
-            monkeypatch.setattr(rollout, "_PAYS_IF_CACHED_S", pays_s)
+            monkeypatch.setattr(rollout, "_PAYS_IF_READY_S", pays_s)
             monkeypatch.setattr(rollout, "_PAYS_S", pays_s)
             batch = run(policies.get(name), episodes, 4, V).batch
             logs.append([np.asarray(array).tobytes() for array in (batch.log, batch.order, batch.slots)])

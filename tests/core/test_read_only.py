@@ -11,6 +11,7 @@ from bufgym.benchmark import run as bench
 from bufgym.benchmark.tasks.queue import QueueTask
 from bufgym.envs import SenderEnv
 from bufgym.envs.expert import Player
+from bufgym.kernels.source import generated
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.model.topics import Topic
@@ -43,7 +44,8 @@ def writer(write: str, **options: Any) -> Policy:
     made: dict[str, Any] = {"__name__": __name__}
     accept = "return -2 if len(buffer.slots) < buffer.capacity else 0"
     queued = "True" if write.startswith("arrival") else "len(buffer.slots) > 0"
-    exec(f"def on_arrival(buffer, arrival, memory):\n if {queued}: {write}\n {accept}", made)
+    text = f"def on_arrival(buffer, arrival, memory):\n if {queued}: {write}\n {accept}"
+    exec(compile(text, generated(text), "exec"), made)
     return Policy("test-writer", made["on_arrival"], **options)
 
 

@@ -283,9 +283,9 @@ test_what_is_refused = refused(
 
 
 @pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled"))
-def test_what_numba_cannot_compile_says_so_in_one_line() -> None:
+def test_what_is_no_kernel_says_so_in_one_line() -> None:
     field("odd", per="context", compile=True)(odd)
-    refuse("field 'odd': Numba cannot compile it; leave out compile=True", SenderEnv, "interruption", fields=["odd"])
+    refuse("field 'odd': is no kernel: ", SenderEnv, "interruption", fields=["odd"])
 
 
 L, FRAMES = 2, 6

@@ -175,7 +175,7 @@ def test_broken_files(tmp_path: Path, kind: Callable[[Path], Kind]) -> None:
 
 def test_command_lines() -> None:
     """In a process of its own: commands change the folder, the terminal and what is imported. Nothing is compiled."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_DISABLE_JIT": "1", "PYTHONWARNINGS": "ignore"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "BUFGYM_KERNELS": "python", "PYTHONWARNINGS": "ignore"}
     command = [sys.executable, str(HERE / "commands.py"), str(max(30, COUNT // 10)), SEED]
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", env=environment)
     assert done.returncode == 0, done.stderr[-3000:]

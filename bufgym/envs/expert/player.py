@@ -1,19 +1,16 @@
 """A fixed policy as the player of an environment, decision by decision."""
 
-import functools
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import compile_signature, entry_point_of, named, with_address
+from bufgym.jit import kernel, named
 from bufgym.model.buffer import ACCEPT, HOLD
 from bufgym.policies import Policy
-from bufgym.policies.registry import signatures
 from bufgym.sim import Senders
 from bufgym.sim.rollout import answer_of, python_arrival, python_view
-from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch, batch_type
+from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS, SOCKET_WAITS, Batch
 from bufgym.sim.view import arrival_of, view
 from bufgym.utils.errors import BufgymError
 
@@ -38,7 +35,7 @@ class Player:
             raise BufgymError(f"policy {policy.name} {reason}: it can be benchmarked, but not play in an environment")
         self.policy = policy
         self._parameters = policy.parameter_array
-        self._functions = tuple(map(with_address, signatures(), policy.compiled)) if policy.compile else None
+        self._functions = policy.compiled if policy.compile else None
         self.memory = np.zeros((n, 1))
         self._begun = np.zeros(n, np.int64)
         self._heard = np.zeros(n, np.int64)
@@ -83,9 +80,7 @@ class Player:
         batch = senders.batch._replace(parameters=self._parameters)
         on_arrival, on_departure, _, on_send = self._functions
         hears, answers = self.policy.hears_departures, actions.copy()
-        compiled_ask(bool(batch.several))(
-            batch, self.memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers
-        )
+        ask(batch, self.memory, self._heard, rows, on_arrival, on_departure, on_send, hears, answers)
         for sends in (False, True):
             asked = rows[waiting[rows] == (SOCKET_WAITS if sends else ARRIVAL_WAITS)]
             actions[asked] = self._checked(answers[asked], senders.capacity, sends=sends)
@@ -115,6 +110,7 @@ class Player:
         return as_actions(answers, capacity)
 
 
+@kernel
 def ask(
     batch: Batch,
     memory: NDArray[np.float64],
@@ -138,13 +134,3 @@ def ask(
             answers[i] = on_send(buffer, memory[i])
         else:
             answers[i] = on_arrival(buffer, arrival_of(batch, i), memory[i])
-
-
-@functools.cache
-def compiled_ask(several: bool) -> Any:
-    """``ask`` compiled once for every policy, like the rollout."""
-    on_arrival, on_departure, _, on_send = map(numba.types.FunctionType, signatures())
-    types = numba.types
-    numbers, memory = types.Array(types.int64, 1, "C"), types.Array(types.float64, 2, "C")
-    kinds = batch_type(several), memory, numbers, numbers, on_arrival, on_departure, on_send, types.boolean, numbers
-    return entry_point_of(compile_signature(types.void(*kinds), ask))

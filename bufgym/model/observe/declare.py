@@ -45,7 +45,7 @@ class Field:
     high: float = 1.0
     """Largest value."""
     compile: bool = True
-    """Promises that Numba can compile the function; otherwise it runs as ordinary Python."""
+    """Promises that the function is a kernel; otherwise it runs as ordinary Python."""
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Pickle a field of a table by its place, as its function may have no name."""

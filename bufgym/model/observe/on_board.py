@@ -157,7 +157,8 @@ def observe_on_board_slots(buffer: Buffer, arrival: Any, rows: NDArray[np.floati
     """Write every value of ``ON_BOARD_SLOT_FIELDS`` into ``rows`` (float[fields, L + 1]); the newcomer is last."""
     s, last = len(buffer.slots), buffer.capacity
     queue = queue_of(buffer, arrival)
-    rows[:, s:last] = 0.0
+    for f in range(len(rows)):
+        rows[f, s:last] = 0.0
     for k in range(s + 1):
         _write_slot(buffer, arrival, k, queue, k if k < s else last, rows)
 

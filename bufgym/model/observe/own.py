@@ -3,7 +3,7 @@
 docs/guide/yours-to-change.md has an example of each.
 
 Fields and terms take part only where they are named. Text that has to stand alone names ``module:function``, which
-imports the module that registers them. ``compile=True`` promises that Numba can compile the function.
+imports the module that registers them. ``compile=True`` promises that the function is a kernel.
 """
 
 import math
@@ -92,7 +92,7 @@ def field(
         unit: for lists, as the first line of the function's docstring; how it is scaled.
         low: least value; an empty slot and an ended episode read 0, so low <= 0 <= high.
         high: largest value. A number outside is an error.
-        compile: promises that Numba can compile the function.
+        compile: promises that the function is a kernel.
 
     Raises:
         BufgymError: the name is taken or no name, or a rule above is broken.

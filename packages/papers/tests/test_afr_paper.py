@@ -109,7 +109,7 @@ def test_the_timed_loop_makes_the_policys_own_decisions(name: str) -> None:
     assert buffer.slots["seq"].tolist() == list(range(1, 9))
     assert arrivals["seq"].tolist() == list(range(9, 39))
     start, memory = policy.new_memory(2)
-    looped = afr_fig9.compiled_loop()(buffer, arrivals, memory, start, policy.compiled[0], 2)
+    looped = afr_fig9.decide_often(buffer, arrivals, memory, start, policy.compiled[0], 2)
     memory = policy.new_memory()[0]
     assert looped == 2 * sum(policy.compiled[0](buffer, arrivals[k], memory) for k in range(30))
 

@@ -11,7 +11,6 @@ from bufgym.cli.options import Count, PolicyFile, PortNumber, one_policy
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.libraries import library
 from bufgym_live.robot import commands as live
-from bufgym_live.robot.decided_in import Compiled, decide_in_python
 
 
 @Parameter(name="*", group=Group.create_ordered("The relay"))
@@ -74,7 +73,6 @@ async def robot(
     policy_file: PolicyFile = None,
     capacity: Count = 32,
     window: live.Window = None,
-    compiled: Compiled = False,
 ) -> None:
     """Run a robot, recorded or of ROS; Ctrl-C ends it.
 
@@ -89,7 +87,6 @@ async def robot(
         capacity: L, messages.
     """
     _needs_the_extra()
-    decide_in_python(unless=compiled)
     from bufgym.scenario import read_client
     from bufgym_live.relay.robot import Robot
 

@@ -5,14 +5,10 @@ A relay listens before any policy is loaded. Modules that compile are imported a
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import signal
 import threading
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from bufgym.utils.errors import BufgymError
-from bufgym.utils.processes import compiling
 from bufgym_live.relay.plain import PLAIN, Latest
 
 if TYPE_CHECKING:
@@ -53,35 +49,10 @@ def warm(name: str) -> Rule:
 
 
 def compiled(chosen: Policy) -> Policy:
-    """Compile a policy that is given as an object.
-
-    Another process compiles a policy that is not cached yet, so that clients can connect meanwhile. That process knows
-    all policies except user-defined ones.
-    """
+    """Compile a policy that is given as an object, if it is not yet."""
     with _COMPILING:
-        if not is_cached(chosen) and compiling(__name__, "fill_cache", chosen.name) < 0:
-            raise BufgymError(f"policy {chosen.name}: stopped while it was compiled")
         _used(chosen)
-        return chosen
-
-
-def is_cached(chosen: Policy) -> bool:
-    """Whether the policy is in the compiler's cache; if so, load it."""
-    from bufgym.jit import NotCachedError, cached_only
-
-    try:
-        with cached_only():
-            _used(chosen)
-    except NotCachedError:
-        return False
-    return True
-
-
-def fill_cache(name: str) -> None:
-    """Compile the policy of this name, in a process of its own; leave a user-defined one to its own process."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    with contextlib.suppress(BufgymError):
-        _used(policy(name))
+    return chosen
 
 
 def _used(chosen: Rule) -> None:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 from bufgym.cli.options import Count, Least0, PolicyFile, Positive, command_line, load_policies, policies_of
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.commands import REDRAW_S, redraw
-from bufgym_live.robot.decided_in import decide_in_python
 
 if TYPE_CHECKING:
     from bufgym_live.robot.tunnel import Tunnel
@@ -137,7 +136,6 @@ def view(log: Path, /, *, follow: bool = False) -> None:
         log: Log of send --log, even a growing one.
         follow: Show it again as the log grows; Ctrl-C ends it.
     """
-    decide_in_python()
     from bufgym_live.robot import read_log
     from bufgym_live.robot.view import View
 

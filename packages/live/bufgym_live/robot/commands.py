@@ -9,7 +9,6 @@ from cyclopts import Parameter
 
 from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, checked, one_policy
 from bufgym.utils.errors import BufgymError
-from bufgym_live.robot.decided_in import Compiled, decide_in_python
 from bufgym_live.robot.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S, host_port
 
 if TYPE_CHECKING:
@@ -71,7 +70,6 @@ async def send(
     transport: Transport = "tcp",
     window: Window = None,
     backoff: Backoff = BACKOFF_S,
-    compiled: Compiled = False,
     log: str | None = None,
     view: bool = False,
 ) -> None:
@@ -90,7 +88,6 @@ async def send(
     """
     import math
 
-    decide_in_python(unless=compiled)
     from bufgym import traces
     from bufgym.model import qoi
     from bufgym_live.robot import LogFile, PolicyQueue
@@ -207,7 +204,6 @@ async def link(
         delay_ms: Each way.
         back: The messages come back from there (a publisher of ROS 1).
     """
-    decide_in_python()  # nothing here is worth compiling
     from bufgym import traces
     from bufgym.model.link import Link
     from bufgym_live.robot.shaped import ShapedLink

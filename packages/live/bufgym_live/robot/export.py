@@ -8,7 +8,6 @@ from cyclopts import Group, Parameter
 from bufgym.cli import export as of_weights
 from bufgym.cli.export import WeightOptions
 from bufgym.cli.options import Count, given, refuse
-from bufgym_live.robot.decided_in import decide_in_python
 
 
 @Parameter(name="*", group=Group.create_ordered("C (--to c): one C99 header that decides as Python does"))
@@ -49,7 +48,6 @@ def export(
     if to == "safetensors":
         of_weights.export(model, out, weights=weights)
         return
-    decide_in_python()
     from bufgym import policies
     from bufgym.model import qoi
     from bufgym_live.robot import c as header

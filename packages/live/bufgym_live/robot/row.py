@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import JIT, entry_point_of, with_address
+from bufgym.jit import Repeated
 from bufgym.model.link import Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym.policies.registry import Policy, signatures
+from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
-from bufgym.sim.rollout import compiled_rollout, python_rollout
+from bufgym.sim.rollout import python_rollout, rollout
 from bufgym.sim.state import CARRIES, NOT_YET, Batch
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
@@ -57,13 +57,8 @@ class LiveRow:
         self.senders.load(0, Episode(messages(np.array([0]), 1), Link(nothing), window=window, ends_us=ends_us))
         self.senders.follow(policy)
         self.memory = policy.new_memory(1, self.senders.capacity)
+        self._again = Repeated()
         self._use(self.senders.batch, room)
-        self._functions: Any = policy.compiled if policy.compile else None
-        if JIT and policy.compile:
-            self._functions = tuple(map(with_address, signatures(), policy.compiled))
-        self._rollout: Any = (
-            entry_point_of(compiled_rollout(False, bool(self.batch.several))) if self._functions else None
-        )
 
     def _use(self, batch: Batch, room: int) -> None:
         """Switch to these arrays; columns of future messages are free."""
@@ -149,10 +144,11 @@ class LiveRow:
 
     def _advance(self) -> None:
         """Process everything that is due."""
-        if self._functions is None:
-            python_rollout(self.batch, None, self.memory, self.policy)
+        policy = self.policy
+        if policy.compile:
+            self._again(rollout, self.batch, None, self.memory, *policy.compiled, policy.hears_departures)
         else:
-            self._rollout(self.batch, None, self.memory, *self._functions, self.policy.hears_departures)
+            python_rollout(self.batch, None, self.memory, policy)
 
     def _tell(self, now_us: int, position: int) -> None:
         """Add a knot; the simulator looks up only the last two."""

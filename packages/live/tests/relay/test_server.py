@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import subprocess
-import sys
 import threading
 import urllib.request
 from http.client import HTTPConnection
@@ -13,24 +11,14 @@ import fleet_demo
 import pytest
 from cli_cases import fails
 from loop_cases import beside
-from refusal_cases import refuse
 from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
 
-from bufgym.policies import Policy, registry
-from bufgym.utils import processes
+from bufgym.policies import Policy
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies
 from bufgym_live.relay import server as serving
 from bufgym_live.relay.config import Limits, Rule
 from bufgym_live.relay.wire import Message
-
-
-def test_a_relay_listens_before_the_compiler_is_imported() -> None:
-    """Robots come back to one that was killed as soon as it listens; its default rule needs no compiler at all."""
-    queue = "p.new_queue(p.warm('robofleet'), 8).put(b'', 1, topic=0)"
-    program = f"import sys; from bufgym_live.relay import policies as p, server; {queue}; print('numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.strip() == "False"
 
 
 async def test_a_message_goes_to_each_subscriber_but_its_sender(corner: Corner) -> None:
@@ -222,29 +210,6 @@ async def test_the_page_does_not_wait_for_the_compiler(monkeypatch: pytest.Monke
         finally:
             compiler.set()
         assert (await viewer.next()).topic.startswith("/robots/robot-1/")
-
-
-def test_what_is_not_cached_another_process_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, code = list[tuple[str, ...]](), 0
-
-    def compiling(*words: str) -> int:
-        asked.append(words)
-        return code
-
-    monkeypatch.setattr(policies, "is_cached", lambda chosen: False)
-    monkeypatch.setattr(policies, "compiling", compiling)
-    assert policies.compiled(registry.get("afr")).name == "afr"
-    code = -2  # Ctrl-C
-    refuse("policy afr: stopped while it was compiled", policies.compiled, registry.get("afr"))
-    assert asked == 2 * [("bufgym_live.relay.policies", "fill_cache", "afr")]
-
-
-def test_a_call_in_another_process(capfd: pytest.CaptureFixture[str]) -> None:
-    """It finds what this one finds, and its exit code comes back."""
-    assert processes.compiling("os", "system", "echo found") == 0
-    assert capfd.readouterr().out == "found\n"
-    assert processes.compiling("sys", "exit", "wrong") == 1
-    assert capfd.readouterr().err == "wrong\n"
 
 
 @pytest.mark.parametrize(

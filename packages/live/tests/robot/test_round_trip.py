@@ -22,7 +22,6 @@ from needs import needs
 from ros1_cases import played
 
 from bufgym import policies
-from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
@@ -272,35 +271,3 @@ def test_where_no_namespace_can_be_made(monkeypatch: pytest.MonkeyPatch, capsys:
     assert main(["live", "validate", *words, "--rtt", "20"]) == 0
     out = capsys.readouterr().out
     assert "round trip 20 ms" in out and "it needs root" in out and "cannot show" in out
-
-
-# --- a program that needs no compiler --------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(not JIT, reason=needs("compiled", "nothing is compiled here"))
-def test_a_live_program_decides_without_a_compiler() -> None:
-    """In plain Python, Numba is not even imported, and the decisions are those of compiled code."""
-    code = """
-import sys
-from bufgym_live.robot.decided_in import decide_in_python
-decide_in_python(unless={compiled})
-from bufgym_live.robot import PolicyQueue
-now = [0.0]
-tell = lambda record: record["event"] == "dropped" and print(record["seq"])
-queue = PolicyQueue("learned", 4, log=tell, clock=lambda: now[0])
-for k in range(40):
-    now[0] = 0.1 * (k + 1)
-    queue.put(b"", 1000 + k % 7)
-    if k % 3 == 2:
-        queue.get()
-        queue.gone()
-print("numba" in sys.modules)
-"""
-    printed = [
-        subprocess.run(
-            [sys.executable, "-c", code.format(compiled=compiled)], capture_output=True, text=True, check=True
-        ).stdout.split()
-        for compiled in (False, True)
-    ]
-    assert printed[0][-1] == "False" and printed[1][-1] == "True"
-    assert printed[0][:-1] == printed[1][:-1] and len(printed[0]) > 10

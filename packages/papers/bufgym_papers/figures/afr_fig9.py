@@ -7,20 +7,18 @@ motion, and `orbbuf-images` compares images of a made-up room at 640x480 and nee
 depend on this machine and differ from run to run, so compare orders of magnitude.
 """
 
-import functools
 import time
 import timeit
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, sim
-from bufgym.jit import JIT, compile_signature, records
+from bufgym.jit import JIT, kernel, records
 from bufgym.model.buffer import ACCEPT, MESSAGE, Buffer
-from bufgym.policies.registry import Policy, signatures
+from bufgym.policies.registry import Policy
 from bufgym.scenario import Interruption
 from bufgym.utils.errors import BufgymError
 from bufgym_papers.figures.figure import COLOURS, Figure, about, finish, legend_below, whole
@@ -35,6 +33,7 @@ HOW = "compiled loop" if JIT else "Python loop (compilation is off)"  # Kind of 
 REPEATS = 5  # Compiled loops timed. The fastest counts, because the others shared the machine with other work.
 
 
+@kernel
 def decide_often(
     buffer: Buffer,
     arrivals: NDArray[Any],
@@ -52,16 +51,6 @@ def decide_often(
         for k in range(len(arrivals)):
             total += on_arrival(buffer, arrivals[k], memory)
     return total
-
-
-@functools.cache
-def compiled_loop() -> Any:
-    """Compile ``decide_often`` once for all policies, as the rollout is."""
-    arrival, *_ = signatures()
-    view, message, reals = arrival.args
-    messages = numba.types.Array(message, 1, "C")
-    int_ = numba.types.int64
-    return compile_signature(int_(view, messages, reals, reals, numba.types.FunctionType(arrival), int_), decide_often)
 
 
 def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
@@ -86,12 +75,14 @@ def full_queue(capacity: int, arrivals: int) -> tuple[Buffer, NDArray[Any]]:
 
 def inside_us(policy: Policy, buffer: Buffer, arrivals: NDArray[Any], decisions: int) -> float:
     """Time one decision in a compiled loop, in us; the loop is Python where compilation is off."""
-    loop, on_arrival = compiled_loop(), policy.compiled[0]
+    on_arrival = policy.compiled[0]
     buffer = buffer._replace(parameters=policy.parameter_array)
     rounds = max(1, decisions // len(arrivals))
     start, memory = policy.new_memory(2, buffer.capacity)
-    loop(buffer, arrivals, memory, start, on_arrival, 1)
-    timed = timeit.repeat(lambda: loop(buffer, arrivals, memory, start, on_arrival, rounds), number=1, repeat=REPEATS)
+    decide_often(buffer, arrivals, memory, start, on_arrival, 1)
+    timed = timeit.repeat(
+        lambda: decide_often(buffer, arrivals, memory, start, on_arrival, rounds), number=1, repeat=REPEATS
+    )
     return 1e6 * min(timed) / (rounds * len(arrivals))
 
 

@@ -1,20 +1,19 @@
 """Calls of a program in an episode with the simulator's decisions, the reference for the header's C."""
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import JIT, compile_signature, kernel, records, unchecked_at
+from bufgym.jit import kernel, records, unchecked_at
 from bufgym.model.link import FOREVER, Link
 from bufgym.model.qoi import Value
-from bufgym.policies.registry import Policy, signatures
+from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.decisions import decide
-from bufgym.sim.state import DECISION, DEPARTURE, END, Batch, batch_type
+from bufgym.sim.state import DECISION, DEPARTURE, END, Batch
 from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
@@ -45,6 +44,7 @@ def _note(calls: NDArray[Any], n: int, kind: int, at_us: int, size_bytes: int) -
     return n + 1
 
 
+@kernel
 def _record(
     batch: Batch, memory: Any, on_arrival: Any, on_departure: Any, hears_departures: bool, calls: NDArray[Any]
 ) -> int:
@@ -82,20 +82,6 @@ def _record(
     return n
 
 
-@functools.cache
-def _compiled_record() -> Any:
-    """Compile ``_record`` for every compiled policy, where there is a compiler."""
-    if not JIT:
-        return _record
-    import numba
-
-    arrives, departs, _, _ = (numba.types.FunctionType(signature) for signature in signatures())
-    memory = numba.types.Array(numba.types.float64, 2, "C")
-    calls = numba.types.Array(numba.from_dtype(CALL), 1, "C")
-    signature = numba.types.int64(batch_type(several=False), memory, arrives, departs, numba.types.boolean, calls)
-    return compile_signature(signature, _record)
-
-
 def recorded(
     policy: Policy, episodes: Sequence[Episode], capacity: int, value: Value, max_bytes: int | None = None
 ) -> NDArray[Any]:
@@ -116,7 +102,7 @@ def recorded(
     on_arrival, on_departure, _, _ = policy.compiled
     batch = senders.batch._replace(parameters=policy.parameter_array)
     memory = policy.new_memory(len(episodes), capacity)
-    n = _compiled_record()(batch, memory, on_arrival, on_departure, policy.hears_departures, calls)
+    n = _record(batch, memory, on_arrival, on_departure, policy.hears_departures, calls)
     return calls[:n]
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import ros1
-from bufgym_live.robot.decided_in import decide_in_python
 from bufgym_live.robot.sockets import BACKOFF_S
 
 RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': rospy's own queue"
@@ -25,11 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--log", metavar="FOLDER", help="log every decision there")
     tries = "longest time between two tries of TCP at a dead link, s (1; Linux from 6.15 on)"
     parser.add_argument("--backoff", type=float, default=BACKOFF_S, metavar="S", help=tries)
-    parser.add_argument("--compiled", action="store_true", help="decide in 0.05 ms, after some seconds of compiling")
     parser.add_argument("node", metavar="NODE.py", help="the node")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGS", help="its arguments")
     options = parser.parse_args(arguments)
-    decide_in_python(unless=options.compiled)
     from bufgym.model import qoi
 
     try:

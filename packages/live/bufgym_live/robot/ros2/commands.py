@@ -9,7 +9,6 @@ from cyclopts import Parameter
 from bufgym.cli.options import Count, Least0, PolicyFile, one_policy
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.commands import PORT, RECEIVER, Backoff, Host, Port, Transport, Window, address, listens_at, say
-from bufgym_live.robot.decided_in import Compiled, decide_in_python
 from bufgym_live.robot.sockets import BACKOFF_S, host_port
 
 RosArgs = Annotated[
@@ -34,7 +33,6 @@ async def send(
     transport: Transport = "tcp",
     window: Window = None,
     backoff: Backoff = BACKOFF_S,
-    compiled: Compiled = False,
     log: str | None = None,
     ros_args: RosArgs = (),
 ) -> None:
@@ -51,7 +49,6 @@ async def send(
         odom: Topic with poses, which give x to the topics that move.
         log: Log every decision to this file (.mcap), for live replay.
     """
-    decide_in_python(unless=compiled)
     from bufgym.model import qoi
     from bufgym.scenario import read_client
     from bufgym_live.robot import LogFile
@@ -126,7 +123,6 @@ async def receive(
         at: HOST:PORT to listen on, in place of --host and --port.
         hold: From the start a topic's messages wait for a reader, and the sender with them, so many seconds at most.
     """
-    decide_in_python()
     from bufgym_live.robot.ros2 import relay
 
     host, port = listens_at(at, host, port)
