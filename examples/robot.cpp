@@ -51,7 +51,7 @@ int main(int words, char **) {
         if (words == 1)
             us = k * 33333LL, x = k;
         send_until(us);
-        bufgym_message message = {us, bytes, x, 0.0, 0, nullptr};
+        bufgym_message message = {us, bytes, x, 0.0, 0, nullptr, 0.0, 0};
         int64_t left = queue.busy ? std::min(sending.size_bytes, position - carried(us)) : 0;
         int decision = bufgym_arrival(&queue, message, left);
         std::printf("%9lld us: %s%.0d, %d queued\n", us,

@@ -51,6 +51,7 @@ def step_rows(
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
         # Each row's messages lie in memory of their own: fetch a later row's next one while working on this row.
+        prefetch(batch.senders, rows[min(r + 2 * _AHEAD, last)])
         later = rows[min(r + _AHEAD, last)]
         soon = min(batch.senders[later].next + 1, batch.arrivals.shape[1] - 1)
         prefetch(batch.arrivals, later, soon)

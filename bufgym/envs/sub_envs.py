@@ -87,6 +87,7 @@ class SubEnvs:
             self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
         self._again = [Repeated() for _ in self._threads.parts]
+        self._begin = Repeated()
         self._actions = np.zeros(n, np.int64)
 
         self.choices = None
@@ -172,7 +173,7 @@ class SubEnvs:
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
-        self._run(self._again[0], self._load(rows, episodes), NO_ACTIONS)
+        self._run(self._begin, self._load(rows, episodes), NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             if self._regret is not None:

@@ -1,7 +1,7 @@
-"""Elements and stretches of arrays in kernels, without the checks that Numba adds to every index.
+"""Elements and stretches of arrays in kernels, without what Python's indexing asks: whether an index is negative.
 
-The caller guarantees that indices are >= 0 and slices lie inside the array. Numba's own indexing checks the sign of
-every index and the ends of every slice, which is a fifth of a rollout's instructions.
+The caller guarantees that indices are >= 0 and slices lie inside the array. To look at the sign of every index and at
+the ends of every slice is a fifth of a rollout's instructions.
 """
 
 from typing import Any, NamedTuple, TypeVar, cast
@@ -52,5 +52,8 @@ def unchecked_table(array: NDArray[Any], rows: int, columns: int) -> Any:
     return array[: rows * columns].reshape(rows, columns)
 
 
-def prefetch(array: NDArray[Any], i: int, k: int) -> None:
-    """Ask the processor to fetch ``array[i, k]`` into its cache, without waiting for it; nothing in plain Python."""
+def prefetch(array: NDArray[Any], i: int, k: int = 0) -> None:
+    """Ask the processor to fetch ``array[i, k]``, or ``array[i]`` of one axis, into its cache, and do not wait for it.
+
+    Plain Python does nothing.
+    """

@@ -121,16 +121,14 @@ class Kernel:
 
     def code(self, arguments: tuple[Any, ...], ready: bool = False) -> Any:
         """The code for arguments of such kinds; None where it runs as Python, or, if it must be ``ready``, is not."""
-        from bufgym.jit.values import key_of
+        from bufgym.jit import code
+        from bufgym.jit.values import annotated, key_of, kind_of
 
+        # One without an address must not meet the code for those that have one.
+        if code.noted is None and any(isinstance(a, Hook) and a.address is None for a in arguments):
+            return None
         key = tuple(map(key_of, arguments))
         if key not in self._codes:
-            from bufgym.jit import code
-
-            if code.noted is None and any(isinstance(a, Hook) and a.address is None for a in arguments):
-                return None
-            from bufgym.jit.values import annotated, kind_of
-
             hints = list(inspect.get_annotations(self.py_func).items())
             places = dict(hints)
             names = cast(Any, self.py_func).__code__.co_varnames

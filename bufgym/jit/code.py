@@ -10,6 +10,7 @@ import functools
 import hashlib
 import json
 import linecache
+import os
 import re
 import shutil
 import sys
@@ -120,7 +121,7 @@ def add(program: Any, function: Any, kinds: Any, symbol: str) -> None:
         program.hook(symbol, function, kinds)
     else:
         result = program.entry(symbol, function, kinds)
-        program.text(f'EXPORT const char *{symbol}_gives = "{spelled(result)}";')
+        program.text(f'BG_EXPORT const char *{symbol}_gives = "{spelled(result)}";')
 
 
 # ---------------------------------------------------------------- where it is
@@ -151,7 +152,7 @@ def built() -> tuple[Any, dict[str, str], bool, bool]:
         listed = json.loads((BUILT / "entries.json").read_text(encoding="utf-8"))
         same = listed["sources"] == sources()
         compares = listed["python"] == sys.implementation.cache_tag and listed["translator"] == translator()
-        if WAY == CHECKED or not (same or compares):
+        if WAY == CHECKED or os.environ.get("BUFGYM_CFLAGS") or not (same or compares):  # C of another kind is wanted
             return None, {}, False, False
         return ctypes.CDLL(str(BUILT / f"bufgym_kernels{library_suffix()}")), listed["states"], same, compares
     except (OSError, ValueError, KeyError):
@@ -182,6 +183,8 @@ def _made(function: Any, kinds: Any, symbol: str, ready: bool) -> Any:
     """A library of the kernel alone, from the folder of cached code, or made now."""
     compiler = find()
     if compiler is None:
+        if ready:
+            return None
         say_once(f"no C compiler: {function.__qualname__} runs as plain Python, much slower; {HINT}")
         return None
     depends = repr((state_of(function, _list(kinds)), symbol, translator(), sys.implementation.cache_tag,

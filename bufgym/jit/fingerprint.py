@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-_VERSIONED = ("numba", "numpy", "llvmlite")
-"""Packages whose version stands for their sources."""
+_VERSIONED = ("numpy",)
+"""Packages whose functions become no code."""
 
 
 def fingerprint(function: Any) -> str:

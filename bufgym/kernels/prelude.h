@@ -1,20 +1,22 @@
 /* Python's arithmetic in C. Whole numbers wrap around (-fwrapv); in a checked build that is a fault. */
+#ifndef BG_PRELUDE
+#define BG_PRELUDE
 #include <math.h>
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
 
 #ifdef __GNUC__
-#define KERNEL static inline __attribute__((always_inline))
+#define BG_KERNEL static inline __attribute__((always_inline))
 #define bg_prefetch(place) __builtin_prefetch(place, 1, 3)
 #else
-#define KERNEL static inline
+#define BG_KERNEL static inline
 #define bg_prefetch(place) ((void)0)
 #endif
 #ifdef _WIN32
-#define EXPORT __declspec(dllexport)
+#define BG_EXPORT __declspec(dllexport)
 #else
-#define EXPORT
+#define BG_EXPORT
 #endif
 
 #ifdef BG_CHECKED
@@ -28,8 +30,8 @@ static inline void bg_fault(const char *where, const char *what, int64_t a, int6
     snprintf(bg_home.text, sizeof bg_home.text, "%s: %s (%lld, %lld)", where, what, (long long)a, (long long)b);
     longjmp(bg_home.place, 1);
 }
-#define CALLED(call) if (setjmp(bg_home.place)) return bg_home.text
-#define RETURNED 0
+#define BG_CALLED(call) if (setjmp(bg_home.place)) return bg_home.text
+#define BG_RETURNED 0
 static inline int64_t bg_inside(int64_t k, int64_t n, const char *where)
 {
     if (k < 0 || k >= n) bg_fault(where, "index outside an array of so many", k, n);
@@ -62,8 +64,8 @@ static inline void bg_divides(int64_t a, int64_t b, const char *where)
 }
 #define BG_WHERE , const char *where
 #else
-#define CALLED(call) (void)call
-#define RETURNED 0
+#define BG_CALLED(call) (void)call
+#define BG_RETURNED 0
 #define BG_WHERE
 #define bg_divides(a, b, where) ((void)0)
 static inline int64_t bg_index(int64_t k, int64_t n) { return k < 0 ? k + n : k; }
@@ -124,4 +126,4 @@ static inline int64_t bg_end(int64_t k, int64_t n)
     return k < 0 ? 0 : k > n ? n : k;
 }
 static inline int64_t bg_span(int64_t first, int64_t end) { return end > first ? end - first : 0; }
-
+#endif

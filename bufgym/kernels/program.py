@@ -16,11 +16,20 @@ PRELUDE = (Path(__file__).parent / "prelude.h").read_text(encoding="utf-8")
 """Python's arithmetic in C."""
 
 
+def _maker(title: str, name: str, fields: list[str]) -> str:
+    """A function that makes a struct: C++ has no compound literals."""
+    parts = [field.rstrip(";").replace("*", "* ").rsplit(" ", 1) for field in fields]
+    heads = ", ".join(f"{kind} {member}" for kind, member in parts)
+    body = " ".join(f"made.{member} = {member};" for _, member in parts)
+    return f"BG_KERNEL struct {title} {name}({heads}) {{ struct {title} made; {body} return made; }}"
+
+
 class Program:
     """Kernels in one C file: ``entry`` and ``hook`` add one with all that it calls, ``source`` is the text."""
 
-    def __init__(self, checked: bool = False) -> None:
-        self.checked = checked
+    def __init__(self, checked: bool = False, prefix: str = "", exported: str = "BG_EXPORT") -> None:
+        """``prefix`` begins all names; ``exported`` is how functions are declared that others call."""
+        self.checked, self.prefix, self.exported = checked, prefix, exported
         self._structs: list[str] = []
         self._types: dict[Any, str] = {}
         self._constants: dict[int, tuple[str, Kind, Any]] = {}
@@ -33,7 +42,8 @@ class Program:
     # ---------------------------------------------------------------- types
 
     def _unique(self, name: str) -> str:
-        """``name``, with a number where it is taken."""
+        """``name`` with the prefix, and a number where it is taken."""
+        name = self.prefix + name.removeprefix(self.prefix)
         self._taken[name] = self._taken.get(name, 0) + 1
         return name if self._taken[name] == 1 else f"{name}_{self._taken[name]}"
 
@@ -68,7 +78,17 @@ class Program:
             title = self._unique(name)
             self._structs.append(f"struct {title} {{ {' '.join(fields)} }};")
             self._types[key] = f"struct {title}"
+            if isinstance(key, tuple):
+                self._structs.append(_maker(title, self.maker(self._types[key]), fields))
         return self._types[key]
+
+    def maker(self, struct: str) -> str:
+        """The function that makes such a struct of its parts."""
+        return f"{self.prefix}of_{struct.removeprefix('struct ').removeprefix(self.prefix)}"
+
+    def known(self, record: Record, struct: str) -> None:
+        """Say that records of this kind are the ``struct``, which is declared elsewhere and may have more fields."""
+        self._types[record] = struct
 
     def handed(self, kind: Kind) -> str:
         """The type of an argument of a function that is called through a pointer: tuples go by address."""
@@ -87,7 +107,7 @@ class Program:
             self._texts.append(f"static {self.c_type(kind.item)} {name}[] = {{ {numbers or 0} }};")
             self._constants[id(array)] = name, kind, array
         name = self._constants[id(array)][0]
-        return f"({self.c_type(kind)}){{ {name}, {', '.join(map(str, array.shape))} }}", kind
+        return f"{self.maker(self.c_type(kind))}({name}, {', '.join(map(str, array.shape))})", kind
 
     # ---------------------------------------------------------------- functions
 
@@ -133,8 +153,8 @@ class Program:
         struct = self._unique(f"call_{plain(function).__name__.strip('<>')}")
         call = f"{'call->result = ' * bool(made.result)}{name}({', '.join(texts)});"
         head = f"struct {struct} {{ {' '.join(fields) or 'char none;'} }};"
-        body = f"    CALLED(call);\n    {call}\n    return RETURNED;"
-        self._texts.append(f"{head}\nEXPORT const char *{symbol}(struct {struct} *call)\n{{\n{body}\n}}\n")
+        body = f"    BG_CALLED(call);\n    {call}\n    return BG_RETURNED;"
+        self._texts.append(f"{head}\nBG_EXPORT const char *{symbol}(struct {struct} *call)\n{{\n{body}\n}}\n")
         return made.result
 
     def hook(self, symbol: str, function: Any, pointer: Pointer) -> None:
@@ -148,7 +168,7 @@ class Program:
         result = self.c_type(pointer.result) if pointer.result else "void"
         if pointer.result:
             call = f"return {made.cast(Value(call, made.result), pointer.result)}"
-        self._texts.append(f"EXPORT {result} {symbol}({', '.join(heads)})\n{{\n    {call};\n}}\n")
+        self._texts.append(f"{self.exported} {result} {symbol}({', '.join(heads)})\n{{\n    {call};\n}}\n")
 
     def text(self, more: str) -> None:
         """Add a declaration."""

@@ -24,7 +24,7 @@ _RESERVED = {
     "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
     "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while", "bool", "true", "false",
     "INFINITY", "NAN", "asm", "typeof", *OF_C, "ceil", "floor", "fabsf", "memcpy", "memmove",
-    "isnan", "isinf", "isfinite", "KERNEL", "EXPORT", "CALLED", "RETURNED",
+    "isnan", "isinf", "isfinite",
 }  # fmt: skip
 _ATOM = re.compile(r"-?[\w.]+|[\w.>\[\]-]+|\w+\([^()]*\)|\([^()]*\)")
 
@@ -53,8 +53,8 @@ class Value(NamedTuple):
 
 
 def name_in_c(name: str) -> str:
-    """A Python name in C. Names that begin with ``bg_`` or ``k_`` are the translator's own."""
-    return f"{name}_" if name in _RESERVED or name.startswith(("bg_", "k_")) else name
+    """A Python name in C. Names that begin with ``bg_``, ``k_`` or ``of_`` are the translator's own."""
+    return f"{name}_" if name in _RESERVED or name.startswith(("bg_", "BG_", "k_", "of_")) else name
 
 
 class NotYetError(Exception):

@@ -38,7 +38,7 @@ class Function(Expressions):
         if isinstance(self.result, Number) and not isinstance(self.tree.body[-1], ast.Return):
             self.lines.append("    return 0;")
         result = c_type(self.result) if self.result else "void"
-        head = f"/* {self.at(self.tree)} */\nKERNEL {result} {name}({', '.join(heads) or 'void'})"
+        head = f"/* {self.at(self.tree)} */\nBG_KERNEL {result} {name}({', '.join(heads) or 'void'})"
         return "\n".join([head, "{", *own, *self.lines, "}", ""])
 
     def parameters(self) -> list[tuple[str, Kind]]:

@@ -49,11 +49,11 @@ class Subscripts(Scope):
 
     def made(self, kind: Tuple, parts: list[str]) -> str:
         """A tuple of these parts; None fields have none."""
-        return f"({self.program.c_type(kind)}){{ {', '.join(parts) or '0'} }}"
+        return f"{self.program.maker(self.program.c_type(kind))}({', '.join(parts) or '0'})"
 
     def made_array(self, kind: Array, start: str, lengths: list[str]) -> str:
         """An array that begins at ``start``."""
-        return f"({self.program.c_type(kind)}){{ {start}, {', '.join(lengths)} }}"
+        return f"{self.program.maker(self.program.c_type(kind))}({', '.join([start, *lengths])})"
 
     def member(self, owner: Value, k: int) -> Value:
         """The k-th item of a tuple."""

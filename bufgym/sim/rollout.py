@@ -139,7 +139,7 @@ _spent_s: dict[Any, float] = {}
 def choose_own(policy: Policy, spent_s: float, *arguments: Any) -> Any:
     """The policy's own rollout, if it pays after so many seconds in the one for all; else None."""
     # Compiling takes seconds, so a policy must have spent about as long; loading takes milliseconds.
-    if not JIT or spent_s <= _PAYS_IF_READY_S:
+    if not JIT or spent_s <= _PAYS_IF_READY_S or getattr(policy.compiled[0], "address", None) is None:
         return None
     own = own_rollout(policy.compiled, policy.hears_departures)
     return own if own.code(arguments, ready=spent_s < _PAYS_S) else None

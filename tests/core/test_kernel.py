@@ -210,6 +210,32 @@ def test_without_a_compiler_a_kernel_runs_as_python_and_one_line_says_so(tmp_pat
     assert done.stderr.count("\n") == int(JIT)
 
 
+OWN = """
+from bufgym.kernels import compiler
+compiler.on_path = compiler.zig = lambda: None
+from bufgym import policies, scenario
+from bufgym.policies import Policy
+from bufgym.scenario.numbered import draw
+from bufgym.sim import run
+
+def mine(buffer, arrival, memory):
+    return -2 if len(buffer.slots) < buffer.capacity else 0
+
+on = scenario.get("lte", duration_s=3.0)
+kept = []
+for policy in (policies.get("drop-oldest"), Policy("mine", mine, compile=True), Policy("plain", mine)):
+    kept.append(run(policy, [draw(on, 1)], 4, on.value).batch.order.tolist())
+assert kept[0] == kept[1] == kept[2]
+print(42)
+"""
+
+
+def test_a_policy_without_a_compiler_decides_as_ever_beside_one_that_is_compiled(tmp_path: Path) -> None:
+    """The rollout has C for functions with an address, and this one has none."""
+    said = run(tmp_path, source=OWN, BUFGYM_CACHE=str(tmp_path / "code"), CC="").stderr
+    assert not JIT or "runs as plain Python" in said
+
+
 @needs_compilation
 def test_a_file_that_changed_since_it_was_imported_is_not_compiled(tmp_path: Path) -> None:
     """Its text would not be that of the function which Python runs."""

@@ -130,6 +130,7 @@ def test_a_step_tells_what_happened_in_it() -> None:
     assert total["spy"] == 2 + 3 + 4 + 4  # messages that have come by then
 
 
+@pytest.mark.kernels
 @pytest.mark.parametrize("env_id", bufgym.ENVIRONMENTS)
 def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
     arguments: dict[str, Any] = {"fields": CHOSEN, "reward": terms_of(env_id), "capacity": 4, **SMALL[env_id]}
@@ -158,6 +159,7 @@ def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
         assert round(total["dropped"]) == -result.dropped
 
 
+@pytest.mark.kernels
 def test_a_batch_is_its_rows() -> None:
     arguments: dict[str, Any] = {"fields": CHOSEN, "reward": ONE_QUEUE, "capacity": 3, **SMALL["bufgym/Uplink-v0"]}
     singles = [SenderEnv("lte", **arguments, actions="slots") for _ in range(3)]
@@ -194,6 +196,7 @@ def test_a_term_of_the_end_is_asked_once_an_episode() -> None:
     assert ended.all() and calls == ["ready", True, "ready", True, True, True]
 
 
+@pytest.mark.kernels
 def test_a_fleet_has_them_too() -> None:
     rewarded: dict[str, Any] = {"term": {"delay": 1.0, "dropped": 0.1}, "reward": "own"}
     envs = FleetVecEnv(2, 3, capacity=3, fields=CHOSEN, duration_s=1.0, **rewarded)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from library_cases import Library
 from needs import needs
 
 from bufgym import policies, scenario
 from bufgym.kernels import compiler
 from bufgym.kernels.kinds import BOOL, FLOAT, INT, KernelError, Pointer, Tuple, array_kind, record_kind
-from bufgym.kernels.library import Library
 from bufgym.kernels.program import Program
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.policies import registry

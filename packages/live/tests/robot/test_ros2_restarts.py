@@ -15,7 +15,7 @@ from bufgym_live.robot import read_log
 def test_nothing_acked_is_lost_and_no_topic_is_left_out(tmp_path: Path) -> None:
     """The queue's log has what the receiver acked (n_T = 4); the viewer has at least as many of each topic.
 
-    Both commands stay under 120 MB, which Numba alone would pass.
+    Both commands stay under 120 MB.
     """
     seen = json.loads(run(REPO / "packages/live/tests/robot/ros2_restarts_session.py", tmp_path).splitlines()[-1])
     log = read_log(tmp_path / "log.mcap")

@@ -190,7 +190,7 @@ def test_the_package_is_one_of_ros_2(tmp_path: Path) -> None:
     node = (folder / "node.cpp").read_text()
     given = {str(param.get("name")) for param in launch.iter("param")} - {"use_sim_time"}
     assert given and all(f'"{name}"' in node for name in given)
-    refuse("policy codel: has no C", rclcpp.write, tmp_path, roscpp.find("codel"))
+    refuse("policy rosbridge: has no C", rclcpp.write, tmp_path, roscpp.find("rosbridge"))
 
 
 async def test_the_nodes_life(node: Path, tmp_path: Path) -> None:

@@ -240,6 +240,7 @@ def test_what_is_left_alone(settings: dict[str, str], said: str, built: Path, no
 
 
 def test_a_policy_without_c_is_refused(tmp_path: Path) -> None:
-    refuse("policy codel: has no C; known: afr", roscpp.write, tmp_path, roscpp.find("codel"))
+    refuse("policy rosbridge: has no C: its queue is unbounded", roscpp.write, tmp_path, roscpp.find("rosbridge"))
+    refuse("policy codel: drops when the socket is free", roscpp.find, "codel")
     (tmp_path / "file").write_text("")
     refuse("file: File exists", roscpp.write, tmp_path / "file", [])

@@ -12,14 +12,14 @@ from bufgym.model.qoi import Value
 from bufgym.policies.registry import Policy
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
-from bufgym.sim.decisions import decide
+from bufgym.sim.decisions import answer_dequeue, decide
 from bufgym.sim.state import DECISION, DEPARTURE, END, Batch
+from bufgym.sim.state import DEQUEUE as DEQUEUE_ASKS
 from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.traces import Trace
-from bufgym.utils.errors import BufgymError
 
-INIT, ARRIVAL, DEQUEUE, SENT, ENDS = range(5)  # Kinds of calls, as in ``parts/parity.h``
+INIT, ARRIVAL, HEAD, DEQUEUE, SENT, ENDS = range(6)  # Kinds of calls, as in ``parts/parity.h``
 
 CALL = np.dtype(
     [
@@ -29,6 +29,7 @@ CALL = np.dtype(
         ("left_bytes", np.int64),  # in the socket, at an arrival
         ("decision", np.int64),  # the policy's, at an arrival
         ("x", np.float64),
+        ("uniform", np.float64),
     ],
     align=True,
 )
@@ -40,13 +41,19 @@ def _note(calls: NDArray[Any], n: int, kind: int, at_us: int, size_bytes: int) -
     """Write call ``n``; return the new number of calls."""
     call = calls[n]
     call.kind, call.at_us, call.size_bytes = kind, at_us, size_bytes
-    call.left_bytes, call.decision, call.x = 0, 0, 0.0
+    call.left_bytes, call.decision, call.x, call.uniform = 0, 0, 0.0, 0.0
     return n + 1
 
 
 @kernel
 def _record(
-    batch: Batch, memory: Any, on_arrival: Any, on_departure: Any, hears_departures: bool, calls: NDArray[Any]
+    batch: Batch,
+    memory: Any,
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    hears_departures: bool,
+    calls: NDArray[Any],
 ) -> int:
     """Run every sender of the batch to its end, record the calls and return their number."""
     n = 0
@@ -73,7 +80,13 @@ def _record(
                 decision = on_arrival(buffer, arrival, memory[i])
                 n = _note(calls, n, ARRIVAL, arrival.arrival_us, arrival.size_bytes)
                 calls[n - 1].x, calls[n - 1].left_bytes, calls[n - 1].decision = arrival.x, buffer.left_bytes, decision
+                calls[n - 1].uniform = arrival.uniform
                 decide(batch, i, decision)
+            elif event == DEQUEUE_ASKS:
+                n = _note(calls, n, HEAD, sender.now_us, 0)
+                drops = on_dequeue(buffer, memory[i])
+                calls[n - 1].decision = int(drops)
+                answer_dequeue(batch, i, drops)
             elif event == DEPARTURE:
                 n = _note(calls, n, DEQUEUE, sender.now_us, 0)
                 if hears_departures:
@@ -85,24 +98,22 @@ def _record(
 def recorded(
     policy: Policy, episodes: Sequence[Episode], capacity: int, value: Value, max_bytes: int | None = None
 ) -> NDArray[Any]:
-    """Record CALL[calls] of the episodes in turn, under a policy that decides at arrivals alone.
+    """Record CALL[calls] of the episodes in turn, under a policy of one queue.
 
     No message may be larger than B, because such a message is dropped without a call.
     """
-    if policy.drops_at_dequeue or policy.schedules:
-        raise BufgymError(f"policy {policy.name}: is asked when the socket is free: must decide at arrivals alone")
     longest = max(len(episode.arrivals) for episode in episodes)
     senders = Senders(len(episodes), capacity, value, max_messages=longest, max_bytes=max_bytes)
     senders.load_all([(i, episode, None) for i, episode in enumerate(episodes)])
     senders.follow(policy)
     senders.batch.senders["shows_left"] = 1
     # An arrival may need as many evictions as the queue holds, but each message is evicted only once.
-    most = sum(2 + 4 * len(episode.arrivals) for episode in episodes)
+    most = sum(2 + 6 * len(episode.arrivals) for episode in episodes)
     calls = records(most, CALL)
-    on_arrival, on_departure, _, _ = policy.compiled
+    on_arrival, on_departure, on_dequeue, _ = policy.compiled
     batch = senders.batch._replace(parameters=policy.parameter_array)
     memory = policy.new_memory(len(episodes), capacity)
-    n = _record(batch, memory, on_arrival, on_departure, policy.hears_departures, calls)
+    n = _record(batch, memory, on_arrival, on_departure, on_dequeue, policy.hears_departures, calls)
     return calls[:n]
 
 

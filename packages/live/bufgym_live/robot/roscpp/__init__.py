@@ -16,7 +16,7 @@ from bufgym.policies import Policy
 from bufgym.traces.formats.text import write_text
 from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError
-from bufgym_live.robot.c.header import SUPPORTED, header
+from bufgym_live.robot.c.header import header, supported
 
 _SOURCE: Final = Path(__file__).with_name("source")
 SHARED: Final = {name: _SOURCE / name for name in ("link.h", "log.h", "motion.h", "policy.cpp", "policy.h")}
@@ -24,10 +24,8 @@ SHARED: Final = {name: _SOURCE / name for name in ("link.h", "log.h", "motion.h"
 _CAPACITY: Final = 64  # ``MOST`` of policy.h
 
 _QUEUE: Final = """
-#define {macro}_OWN_VALUE
-#define {macro}_STRAIGHT bufgym::straight()
-#define {prefix}_value bufgym::value
-#define {prefix}_merging_loss bufgym::merging_loss
+#define {macro}_V bufgym::v.numbers
+#define {macro}_V_SIZE 2
 #include "{prefix}.h"
 BUFGYM_QUEUE({prefix})
 """
@@ -36,8 +34,12 @@ BUFGYM_QUEUE({prefix})
 
 def find(text: str) -> list[Policy]:
     """The policies of ``all``, or of names and files of weights with commas between."""
-    names = [*SUPPORTED, "learned"] if text == "all" else text.split(",")
-    return [policies.load(name) if name.endswith(".safetensors") else policies.get(name) for name in names]
+    names = [*supported()] if text == "all" else text.split(",")
+    found = [policies.load(name) if name.endswith(".safetensors") else policies.get(name) for name in names]
+    late = [policy.name for policy in found if policy.drops_at_dequeue]
+    if late and text != "all":
+        raise BufgymError(f"policy {late[0]}: drops when the socket is free, which the libraries in C++ do not do")
+    return [policy for policy in found if policy.name not in late]
 
 
 def write(folder: str | Path, chosen: Sequence[Policy], files: Mapping[str, Path] | None = None) -> Path:

@@ -3,21 +3,23 @@
    Python did: it must return 0. --- */
 #ifdef BUFGYM_PARITY
 
-enum { BUFGYM_INIT, BUFGYM_ARRIVAL, BUFGYM_DEQUEUE, BUFGYM_SENT, BUFGYM_ENDS };
+enum { BUFGYM_INIT, BUFGYM_ARRIVAL, BUFGYM_HEAD, BUFGYM_DEQUEUE, BUFGYM_SENT, BUFGYM_ENDS };
 
 struct bufgym_call {
     int64_t kind, at_us, size_bytes, left_bytes, decision;
-    double x;
+    double x, uniform;
 };
 
 /* Make this call; the decision, 0 where none is due. */
 static inline int bufgym_play(struct bufgym_queue *q, const struct bufgym_call *call)
 {
-    struct bufgym_message message = {call->at_us, call->size_bytes, call->x, 0.0, 0, 0};
+    struct bufgym_message message = {call->at_us, call->size_bytes, call->x, 0.0, 0, 0, call->uniform, 0};
     if (call->kind == BUFGYM_ARRIVAL)
         return bufgym_arrival(q, message, call->left_bytes);
+    if (call->kind == BUFGYM_HEAD)
+        return bufgym_drops_head(q, call->at_us);
     if (call->kind == BUFGYM_DEQUEUE)
-        bufgym_dequeue(q, call->at_us, &message);
+        bufgym_take(q, call->at_us, &message);
     else if (call->kind == BUFGYM_SENT)
         bufgym_sent(q, call->at_us, call->size_bytes);
     else if (call->kind == BUFGYM_ENDS)

@@ -26,6 +26,8 @@ struct bufgym_message {
     double gain; /* V(x - x of the message kept before it), filled in */
     int64_t seq; /* how many came before it, filled in */
     void *data;  /* yours: never looked at */
+    double uniform; /* a random number in [0, 1), for policies that draw lots; yours to set */
+    int64_t topic;  /* 0: one queue */
 };
 
 struct bufgym_queue {
@@ -37,6 +39,7 @@ struct bufgym_queue {
     int evictions;                 /* for the arrival at hand, which has no room yet; 0: it is settled */
     int64_t now_us;
     int64_t ends_us; /* when the stream ends; yours to set after bufgym_init if you know it */
+    int64_t window;  /* messages that may be in the socket; yours to set after bufgym_init, 1 by default */
     /* the socket */
     int busy;            /* messages in it */
     int64_t held_bytes;  /* all their bytes, those transmitted included */
@@ -60,16 +63,17 @@ struct bufgym_queue {
     int64_t sent_bytes, sending_us;     /* all until the arrival before */
     int64_t drained_bytes, drained_us;  /* since then */
     double memory[@MEMORY_SIZE@];       /* what the policy remembers */
-@SCRATCH@};
+};
 
-static const double bufgym_memory[@MEMORY_SIZE@] = {@MEMORY@};
-@PARAMETERS@
-/* --- Quantity of Information: V = @VALUE@ --- */
+static const double bufgym_memory[] = {@MEMORY@};
+static const double bufgym_parameters[] = {@PARAMETERS@};
+#ifndef BUFGYM_V /* defined, with BUFGYM_V_SIZE, where your program has the numbers of a V of its own */
+static const double bufgym_v[] = {@VALUE_ARRAY@}; /* V = @VALUE@ */
+#define BUFGYM_V bufgym_v
+#define BUFGYM_V_SIZE @VALUE_SIZE@
+#endif
 
-#ifndef BUFGYM_OWN_VALUE /* defined where your program has its own V: all that stands until the #endif */
-#define BUFGYM_STRAIGHT @STRAIGHT@ /* the distance up to which V is straight */
-@VALUE_PART@#endif
-/* --- the policy: @NAME@ --- */
+/* --- what it knows --- */
 
 /* A running mean over about so much time, us, goes on by us microseconds in which so much came. */
 static inline void bufgym_average(double *mean, double amount, double us, double seen_us, double window_us)
@@ -91,8 +95,38 @@ static inline int64_t bufgym_remaining_us(const struct bufgym_queue *q)
     return q->ends_us > q->now_us ? q->ends_us - q->now_us : 0;
 }
 
+/* --- the policy: @NAME@, made from its Python --- */
+
+#ifdef __GNUC__
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#pragma GCC diagnostic ignored "-Wunused-variable"
+#pragma GCC diagnostic ignored "-Wunused-value"
+#pragma GCC diagnostic ignored "-Wunused-but-set-variable"
+#endif
 @POLICY@
+#ifdef __GNUC__
+#pragma GCC diagnostic pop
+#endif
+@TOPIC@
+/* What the policy sees. Until a message is dequeued, gaps count from the oldest queued one, else the arrival before. */
+static inline @VIEW@ bufgym_view(struct bufgym_queue *q)
+{
+    @VIEW@ seen;
+    const int64_t left_bytes = q->busy > 0 ? q->left_bytes : 0;
+    if (q->dequeued == 0) {
+        q->dequeued_arrival_us = q->occupancy > 0 ? q->slots[0].arrival_us : q->previous_us;
+        q->dequeued_x = q->occupancy > 0 ? q->slots[0].x : q->previous_x;
+        q->dequeued_seq = q->occupancy > 0 ? q->slots[0].seq : q->arrived - (q->arrived > 0);
+    }
+@SEEN@    return seen;
+}
 /* --- the queue --- */
+
+static inline double bufgym_value(double distance)
+{
+    return bufgym_value_of(@V@, distance);
+}
 
 /* V of the gap from what is kept before slot k to x; 0 for the first message of all. */
 static inline double bufgym_gain_behind(const struct bufgym_queue *q, int k, double x)
@@ -150,15 +184,11 @@ static inline void bufgym_note(struct bufgym_queue *q, const struct bufgym_messa
     }
 }
 
-/* The policy's answer. Until a message is dequeued, gaps count from the oldest queued one, else the arrival before. */
-static inline int bufgym_ask(struct bufgym_queue *q, const struct bufgym_message *arrival)
+/* The policy's answer. */
+static inline int bufgym_ask(struct bufgym_queue *q, struct bufgym_message *arrival)
 {
-    if (q->dequeued == 0) {
-        q->dequeued_arrival_us = q->occupancy > 0 ? q->slots[0].arrival_us : q->previous_us;
-        q->dequeued_x = q->occupancy > 0 ? q->slots[0].x : q->previous_x;
-        q->dequeued_seq = q->occupancy > 0 ? q->slots[0].seq : arrival->seq - (arrival->seq > 0);
-    }
-    return bufgym_decide(q, arrival);
+    const @VIEW@ seen = bufgym_view(q);
+    return (int)bufgym_on_arrival(&seen, arrival, @MEMORY_PART@);
 }
 
 /* --- to be called by the program --- */
@@ -170,7 +200,8 @@ static inline void bufgym_init(struct bufgym_queue *q, int64_t now_us)
     q->now_us = q->last_dequeue_us = now_us;
     q->ends_us = BUFGYM_FOREVER;
     q->capacity = BUFGYM_CAPACITY;
-    memcpy(q->memory, bufgym_memory, sizeof q->memory);
+    q->window = 1;
+    memcpy(q->memory, bufgym_memory, sizeof bufgym_memory); /* the rest is scratch */
 }
 
 /* A message arrives, while so many bytes of what was dequeued are still in the socket (SIOCOUTQNSD: not sent yet).
@@ -209,11 +240,23 @@ static inline int bufgym_arrival(struct bufgym_queue *q, struct bufgym_message a
     return decision;
 }
 
-/* The socket is free: it takes the oldest message, which is returned; 0 where none is queued, else 1. */
-static inline int bufgym_dequeue(struct bufgym_queue *q, int64_t now_us, struct bufgym_message *head)
+/* Whether the policy drops the oldest message in place of sending it; then it is q->dropped. */
+static inline int bufgym_drops_head(struct bufgym_queue *q, int64_t now_us)
 {
-    if (q->occupancy == 0)
-        return 0;
+    int drops = 0;
+    q->now_us = now_us;
+    if (@DROPS@) {
+        const @VIEW@ seen = bufgym_view(q);
+        drops = bufgym_on_dequeue(&seen, @MEMORY_PART@);
+    }
+    if (drops)
+        bufgym_evict(q, 0);
+    return drops;
+}
+
+/* The socket takes the oldest message, which is returned. */
+static inline void bufgym_take(struct bufgym_queue *q, int64_t now_us, struct bufgym_message *head)
+{
     *head = q->slots[0];
     q->occupancy -= 1;
     memmove(q->slots, q->slots + 1, (size_t)q->occupancy * sizeof q->slots[0]);
@@ -230,7 +273,22 @@ static inline int bufgym_dequeue(struct bufgym_queue *q, int64_t now_us, struct 
     q->dequeued_x = head->x;
     q->dequeued_seq = head->seq;
     q->departures += 1;
-    bufgym_departure(q);
+    q->left_bytes = (q->busy > 1 ? q->left_bytes : 0) + head->size_bytes;
+    if (@HEARS@) {
+        const @VIEW@ seen = bufgym_view(q);
+        bufgym_on_departure(&seen, @MEMORY_PART@);
+    }
+}
+
+/* The socket is free: it takes the oldest message that the policy does not drop, which is returned; 0 where there is
+   none, else 1. Some policies drop here, several messages even. */
+static inline int bufgym_dequeue(struct bufgym_queue *q, int64_t now_us, struct bufgym_message *head)
+{
+    while (q->occupancy > 0 && bufgym_drops_head(q, now_us)) {
+    }
+    if (q->occupancy == 0)
+        return 0;
+    bufgym_take(q, now_us, head);
     return 1;
 }
 

@@ -44,7 +44,7 @@ public:
                  "{\"event\": \"settings\", \"us\": 0, \"policy\": \"%s\", \"parameters\": %s, \"capacity\": %d, "
                  "\"v\": {\"name\": \"%s\", \"numbers\": [%d, %.17g]}, \"topics\": [], \"max_bytes\": null, "
                  "\"decide_at\": \"arrival\", \"window\": 1, \"ends_us\": null}\n",
-                 policy.name, policy.parameters, capacity, v.name.c_str(), int(v.saturating), v.number);
+                 policy.name, policy.parameters, capacity, v.name.c_str(), int(v.numbers[0]), v.numbers[1]);
   }
 
   void put(int64_t us, int64_t seq, int64_t size_bytes, double x, int64_t carried, double took_us)

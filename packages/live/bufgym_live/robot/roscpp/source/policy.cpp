@@ -1,6 +1,7 @@
 #include "policy.h"
 
 #include <cmath>
+#include <random>
 #include <cstdlib>
 #include <ctime>
 
@@ -49,23 +50,22 @@ bool set_value(const std::string &text)
   if (*end || (saturating ? !(number > 0 && std::isfinite(number)) : text.compare(0, colon, "exponential") != 0 || !(number > 0 && number < 1)))
     return false;
   v.name = text;
-  v.saturating = saturating;
-  v.number = saturating ? number : std::log(number);
+  v.numbers[0] = saturating;
+  v.numbers[1] = saturating ? number : std::log(number);
   return true;
 }
 
 double value(double d)
 {
-  if (!v.saturating)
-    return 1.0 - std::exp(d * v.number);
-  const double part = d / v.number;
+  if (v.numbers[0] == 0.0)
+    return 1.0 - std::exp(d * v.numbers[1]);
+  const double part = d / v.numbers[1];
   return part < 1.0 ? part : 1.0;
 }
 
-double merging_loss(double a, double value_a, double b, double value_b)
+double uniform()
 {
-  return v.saturating ? value_a + value_b - value(a + b) : value_a * value_b;
+  static thread_local std::mt19937_64 source(std::random_device{}());
+  return std::uniform_real_distribution<double>(0.0, 1.0)(source);
 }
-
-double straight() { return v.saturating ? v.number : 0.0; }
 }

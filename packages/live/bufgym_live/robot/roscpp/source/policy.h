@@ -56,14 +56,12 @@ private:
 struct Value
 {
   std::string name = "exponential:0.618";
-  bool saturating = false;
-  double number = -0.48126682151547946;  // ln b, or D
+  double numbers[2] = {0.0, -0.48126682151547946};  // 0 and ln b, or 1 and D
 };
 extern Value v;
 bool set_value(const std::string &text);  // exponential:BASE or saturating:DISTANCE; false if it is neither
 double value(double d);
-double merging_loss(double a, double value_a, double b, double value_b);
-double straight();  // the distance up to which V is straight
+double uniform();  // in [0, 1), for policies that draw lots
 }
 
 // A class over the C header of one policy, whose names begin with P (bufgym export --to c --prefix P).
@@ -78,7 +76,7 @@ double straight();  // the distance up to which V is straight
     }                                                                                                \
     int arrival(int64_t at_us, int64_t size_bytes, double x, int64_t left_bytes) override            \
     {                                                                                                \
-      const P##_message message = {at_us, size_bytes, x, 0.0, 0, nullptr};                           \
+      const P##_message message = {at_us, size_bytes, x, 0.0, 0, nullptr, bufgym::uniform(), 0};     \
       return P##_arrival(&q, message, left_bytes);                                                   \
     }                                                                                                \
     int64_t dropped() const override { return q.dropped.seq; }                                       \

@@ -1,4 +1,4 @@
-"""A compiled program in this process: its functions, called with Python's values."""
+"""A program of kernels, compiled and loaded, whose functions tests call by name."""
 
 import ctypes
 import tempfile
