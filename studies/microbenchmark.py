@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.jit import Ints, kernel
+from bufgym.jit import Ints, Repeated, kernel
 
 Reals = NDArray[np.float32]
 
@@ -133,8 +133,10 @@ def passes(n: int, capacity: int) -> tuple[Callable[[], None], int]:
     actions = np.where(rng.random(n) < 0.5, capacity + 1, rng.integers(0, capacity, n))
     bare, mask = Bare.new(n, capacity), np.zeros((n, capacity + 2), np.int8)
 
+    again = Repeated()
+
     def run() -> None:
         for _ in range(10):
-            _step(bare, actions, flat, mask)
+            again(_step, bare, actions, flat, mask)
 
     return run, 10 * n

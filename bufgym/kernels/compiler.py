@@ -28,7 +28,7 @@ _LIBM: Final = (
 )
 """Functions whose result may differ between libraries in the last bit."""
 _FLAGS: Final = (
-    *("-std=c11", "-O2", "-w", "-fwrapv", "-fno-semantic-interposition"),
+    *("-std=c11", "-O3", "-w", "-fwrapv", "-fno-semantic-interposition"),
     *("-ffp-contract=off", "-fno-math-errno", *(f"-fno-builtin-{name}" for name in _LIBM)),
 )
 _ERRORS: Final = 3

@@ -60,6 +60,9 @@ class Function(Expressions):
                 is_up = isinstance(start, ast.Constant) and isinstance(start.value, int) and start.value >= 0
                 if is_up and len(numbers) < 3 and ast.unparse(node.iter.func) == "range":
                     counted.add(id(node.target))
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call):
+                if isinstance(node.targets[0], ast.Name) and ast.unparse(node.value.func) == "np.uint64":
+                    counted.add(id(node.targets[0]))
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and id(node) not in counted:
                 others.add(node.id)

@@ -81,15 +81,23 @@ class Subscripts(Scope):
         lengths = [f"{array.closed}.n{axis}" for axis in range(len(indices), array.kind.axes)]
         return Value(self.made_array(kind, f"{array.closed}.p + {start}", lengths), kind)
 
+    def is_count(self, node: ast.expr) -> bool:
+        """Whether a number is never negative: of a loop from 0 on, ``np.uint64(...)``, and their sums and products."""
+        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Mult):
+            return self.is_count(node.left) and self.is_count(node.right)
+        if isinstance(node, ast.Constant):
+            return isinstance(node.value, int) and node.value >= 0
+        if isinstance(node, ast.Call):
+            return ast.unparse(node.func) in ("np.uint64", "len")
+        return isinstance(node, ast.Name) and node.id in self.counters
+
     def index(self, node: ast.expr, length: str) -> str:
         """An index as C has it: a negative one counts from the end."""
         value = self.whole(node)
         if not self.checked:
             if value.known is not None:
                 return value.text if value.known >= 0 else f"{length} - {-value.known}"
-            if isinstance(node, ast.Name) and node.id in self.counters:  # of a loop from 0 on
-                return value.text
-            if isinstance(node, ast.Call) and ast.unparse(node.func) == "np.uint64":
+            if self.is_count(node):
                 return value.text
         return self.tested("bg_index", value.text, length, node=node)
 

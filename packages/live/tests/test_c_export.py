@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +213,29 @@ def test_the_command_writes_the_header(tmp_path, capsys):
 def test_a_mistake_is_told_in_one_line(words, message, tmp_path, capsys):
     fails(["export", *words.replace("{}", str(tmp_path / "policy.h")).split()], message, capsys)
     assert list(tmp_path.iterdir()) == []
+
+
+PARITY = """
+#define BUFGYM_PARITY
+#include "policy.h"
+#include <stdio.h>
+int main(void) { printf("%d", bufgym_parity()); return 0; }
+"""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", supported())
+def test_on_arm64_too_it_decides_as_python(name, tmp_path):
+    """Compiled by zig with musl's libm, and run by qemu's user mode."""
+    pytest.importorskip("ziglang", reason=needs("zig"))
+    if shutil.which("qemu-aarch64") is None:
+        pytest.skip(needs("qemu"))
+    (tmp_path / "policy.h").write_text(header(policies.get(name), 8, EXPONENTIAL), encoding="utf-8")
+    (tmp_path / "main.c").write_text(PARITY, encoding="utf-8")
+    zig = [sys.executable, "-m", "ziglang", "cc", "-target", "aarch64-linux-musl", "-static"]
+    words = [*zig, "-std=c99", "-O2", "-ffp-contract=off", "main.c", "-o", "main", "-lm"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    assert output("qemu-aarch64", tmp_path / "main") == "0"
 
 
 TWO = """
