@@ -18,7 +18,6 @@ from bufgym.envs import FleetVecEnv, SenderVectorEnv, own
 from bufgym.envs.expert import Clairvoyant, Player, online
 from bufgym.jit import Hook, code, named
 from bufgym.jit.values import NotNumbersError
-from bufgym.kernels.kinds import Pointer
 from bufgym.kernels.program import Program
 from bufgym.model import observe
 from bufgym.policies import ACCEPT, Policy
@@ -124,15 +123,14 @@ def sources(folder: Path) -> list[Path]:
     """Write the kernels' C into ``folder``, and ``entries.json``, which says what each was made from."""
     programs, states = [Program() for _ in range(_FILES)], dict[str, str]()
     for number, (function, kinds) in enumerate(entries()):
-        is_hook = isinstance(kinds, Pointer)
-        symbol = code.symbol_of(code.name_of(function, (kinds,) if is_hook else kinds))
+        symbol = code.symbol_of(function, kinds)
         if symbol in states:
             continue
         try:
             code.add(programs[number % _FILES], function, kinds, symbol)
         except NotNumbersError:
             continue
-        states[symbol] = code.state_of(function, kinds.arguments if is_hook else kinds)
+        states[symbol] = code.state_of(function, kinds)
     files = []
     for number, program in enumerate(programs):
         files.append(folder / f"kernels_{number}.c")

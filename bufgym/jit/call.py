@@ -129,10 +129,9 @@ class Kernel:
             return None
         key = tuple(map(key_of, arguments))
         if key not in self._codes:
-            hints = list(inspect.get_annotations(self.py_func).items())
-            places = dict(hints)
+            hints = inspect.get_annotations(self.py_func)
             names = cast(Any, self.py_func).__code__.co_varnames
-            kinds = tuple(annotated(kind_of(a), places.get(n)) for a, n in zip(arguments, names, strict=False))
+            kinds = tuple(annotated(kind_of(a), hints.get(n)) for a, n in zip(arguments, names, strict=False))
             found = code.entry(self.py_func, kinds, ready)
             if found is None and ready:
                 return None
@@ -193,17 +192,22 @@ class Repeated:
 
     def _take(self, function: Any, arguments: tuple[Any, ...]) -> None:
         """Prepare the call with these arguments."""
-        before, self._arguments = self._arguments, arguments
-        if self._call is not None and function is self._function:
-            changed = [k for k, (one, other) in enumerate(zip(arguments, before, strict=True)) if one is not other]
-            if all(self._call.put(k, before[k], arguments[k]) for k in changed):
-                return
-        self._function, self._call = function, None
-        if isinstance(function, Kernel) and not getattr(_here, "python", False):
-            self._call = function.bound(*arguments)
-            self._run = self._call.plain or self._call
-        else:
-            self._run = functools.partial(function, *arguments)
+        before = self._arguments
+        known, self._function = self._function, None  # whatever fails now: the next call looks at all again
+        if (
+            self._call is None
+            or function is not known
+            or not all(
+                one is other or self._call.put(k, one, other)
+                for k, (one, other) in enumerate(zip(before, arguments, strict=True))
+            )
+        ):
+            if isinstance(function, Kernel) and not getattr(_here, "python", False):
+                self._call = function.bound(*arguments)
+                self._run = self._call.plain or self._call
+            else:
+                self._call, self._run = None, functools.partial(function, *arguments)
+        self._function, self._arguments = function, arguments
 
 
 def say_once(text: str) -> None:

@@ -49,7 +49,8 @@ class Code:
 
 
 def name_of(function: Any, kinds: Any) -> str:
-    """What tells a kernel for these kinds from all others, but for its source."""
+    """What tells a kernel for these kinds, or for a pointer's, from all others, but for its source."""
+    kinds = (kinds,) if isinstance(kinds, Pointer) else kinds
     return f"{_place(function)}({', '.join(map(_described, kinds))})"
 
 
@@ -67,8 +68,9 @@ def _described(kind: Kind) -> str:
     return _place(kind.function) if isinstance(kind, Given) else str(kind)
 
 
-def symbol_of(name: str) -> str:
-    """The name in C of a kernel with this ``name_of``."""
+def symbol_of(function: Any, kinds: Any) -> str:
+    """Its name in C."""
+    name = name_of(function, kinds)
     short = re.sub(r"\W+", "_", name.partition("(")[0].rpartition(".")[2])
     return f"bufgym_{short.strip('_')}_{hashlib.sha256(name.encode()).hexdigest()[:12]}"
 
@@ -80,6 +82,7 @@ def state_of(function: Any, kinds: Any) -> str:
 
 def _given(kinds: Any) -> list[Any]:
     """Functions that become part of the code."""
+    kinds = kinds.arguments if isinstance(kinds, Pointer) else kinds
     inner = [f for kind in kinds if isinstance(kind, Tuple) for f in _given(kind.items)]
     return [*(kind.function for kind in kinds if isinstance(kind, Given)), *inner]
 
@@ -88,7 +91,7 @@ def entry(function: Any, kinds: tuple[Kind, ...], ready: bool = False) -> Code |
     """The code that Python calls; None where there is no compiler, or where it must be ``ready`` and is not."""
     if _noted(function, kinds):
         return None
-    symbol = symbol_of(name_of(function, kinds))
+    symbol = symbol_of(function, kinds)
     try:
         library = _library(function, kinds, symbol, ready)
     except NotNumbersError:
@@ -97,14 +100,15 @@ def entry(function: Any, kinds: tuple[Kind, ...], ready: bool = False) -> Code |
         return None
     run = getattr(library, symbol)
     run.argtypes, run.restype = [ctypes.c_void_p], ctypes.c_char_p
-    return Code(run, kinds, read(ctypes.c_char_p.in_dll(library, f"{symbol}_gives").value.decode()))  # type: ignore[union-attr]
+    gives = ctypes.c_char_p.in_dll(library, f"{symbol}_gives").value or b""
+    return Code(run, kinds, read(gives.decode()))
 
 
 def address(function: Any, pointer: Pointer) -> int | None:
     """The address of a kernel that others call through a pointer of this kind; None where there is no compiler."""
     if _noted(function, pointer):
         return None
-    symbol = symbol_of(name_of(function, (pointer,)))
+    symbol = symbol_of(function, pointer)
     library = _library(function, pointer, symbol, False)
     return None if library is None else ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value
 
@@ -162,8 +166,8 @@ def built() -> tuple[Any, dict[str, str], bool, bool]:
 def _library(function: Any, kinds: Any, symbol: str, ready: bool) -> Any:
     """The library that has a kernel; None where it could not be made, or is not ``ready``."""
     library, states, same, compares = built()
-    own = all(map(is_own, (function, *_given(_list(kinds)))))
-    if symbol in states and ((same and own) or (compares and states[symbol] == state_of(function, _list(kinds)))):
+    own = all(map(is_own, (function, *_given(kinds))))
+    if symbol in states and ((same and own) or (compares and states[symbol] == state_of(function, kinds))):
         return library
     with _LOCK:
         return _made(function, kinds, symbol, ready)
@@ -175,10 +179,6 @@ def is_own(function: Any) -> bool:
     return function.__module__.partition(".")[0] == "bufgym" and not function.__closure__ and code.co_filename[0] != "<"
 
 
-def _list(kinds: Any) -> Any:
-    return kinds.arguments if isinstance(kinds, Pointer) else kinds
-
-
 def _made(function: Any, kinds: Any, symbol: str, ready: bool) -> Any:
     """A library of the kernel alone, from the folder of cached code, or made now."""
     compiler = find()
@@ -187,7 +187,7 @@ def _made(function: Any, kinds: Any, symbol: str, ready: bool) -> Any:
             return None
         say_once(f"no C compiler: {function.__qualname__} runs as plain Python, much slower; {HINT}")
         return None
-    depends = repr((state_of(function, _list(kinds)), symbol, translator(), sys.implementation.cache_tag,
+    depends = repr((state_of(function, kinds), symbol, translator(), sys.implementation.cache_tag,
                     compiler.identity, _lines(function) if WAY == CHECKED else ""))  # fmt: skip
     file = Path(FOLDER, f"{symbol}-{hashlib.sha256(depends.encode()).hexdigest()[:20]}{library_suffix()}")
     if _is_whole(file):

@@ -114,6 +114,10 @@ def test_a_repeated_call_is_the_call_whichever_argument_changes() -> None:
     copy.deepcopy(again)(shift, other, 2.0)
     pickle.loads(pickle.dumps(again))(shift, other, 2.0)
     again(told, 1, 2.0, True, Numbers(one), records(1, CELL)[0])
+    with pytest.raises((KernelError, TypeError)):
+        again(shift, "no array", 1.0)
+    with pytest.raises((KernelError, TypeError)):  # and not the call before once more
+        again(shift, "no array", 1.0)
     assert one.tolist() == [3.5, 3.5] and other.tolist() == [5, 5, 5]
 
 
