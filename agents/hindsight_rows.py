@@ -17,7 +17,7 @@ from bufgym.envs.options import Options
 from bufgym.envs.sub_envs import SubEnvs
 from bufgym.oracle.hindsight import Hindsight
 from bufgym.policies.candidate_network import inputs
-from bufgym.policies.ruled_network import NOT_OFFERED, seen, watcher
+from bufgym.policies.ruled_network import NOT_OFFERED, seen, watched, watcher
 
 Choose = Callable[[NDArray[np.float32], NDArray[np.bool_]], NDArray[np.int64]]
 """(observations [n, inputs], offered actions [n, actions]) -> actions [n]."""
@@ -106,8 +106,8 @@ class TaughtRows:
         actions, numbers, k = self.decisions.shape[1], self.seen.shape[1], self._candidates
         for sub_envs, span, player in zip(self.groups, self.spans, self._players, strict=True):
             player.actions(sub_envs.senders)
-            end = player.memory[:, player.memory.shape[1] - (k + 3) - seen(k) :]
-            self.seen[span], answers = end[:, k + 3 : k + 3 + numbers], end[:, :actions].astype(np.int64)
+            decisions, seen_numbers = watched(player.memory, k)
+            self.seen[span], answers = seen_numbers[:, :numbers], decisions[:, :actions].astype(np.int64)
             self.decisions[span] = np.where(answers == NOT_OFFERED, NOT_OFFERED, as_actions(answers, sub_envs.capacity))
 
     def _act(self, decisions: NDArray[np.int64]) -> None:

@@ -5,8 +5,9 @@ The policy finds the k cheapest candidates and the head, observes them as the en
 
     h <- f, the 6 (k + 1) + 9 observed numbers;  h <- g(W h + b) for each hidden layer;  outputs <- W h + b
 
-where g is tanh or relu. With k + 1 outputs the network is asked at a full buffer alone. With k + 2 it is asked at every
-arrival, and output 0 accepts the newcomer where there is room. See docs/methods.md, "Networks among candidates".
+where g is tanh or relu, in single precision. With k + 1 outputs the network is asked at a full buffer alone. With
+k + 2 it is asked at every arrival, and output 0 accepts the newcomer where there is room. See docs/methods.md,
+"Networks among candidates".
 """
 
 import itertools
@@ -30,11 +31,11 @@ from bufgym.model.observe import (
 )
 from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.scoring import add
 
 CANDIDATES, MASKS, TANH, HIDDEN, WIDTHS = range(5)
 """Header of the parameters: k; whether actions that are not offered are left out; whether g is tanh; hidden
-layers; then the width of each layer, outputs last. The layers' numbers follow: W, a row for each input, and b."""
+layers; then the width of each layer, outputs last. The layers' numbers follow, two of single precision in each
+parameter, the first in its lower half: W, a row for each input, and b."""
 _PER_CANDIDATE, _QUEUE = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS)
 
 
@@ -43,29 +44,81 @@ def inputs(candidates: int) -> int:
     return _PER_CANDIDATE * (candidates + 1) + _QUEUE
 
 
+Singles = NDArray[np.float32]
+
+
 @kernel
-def forward(parameters: NDArray[np.float64], units: NDArray[np.float64], size: int) -> int:
+def forward(parameters: NDArray[np.float64], units: Singles, size: int) -> int:
     """Compute each layer's units behind those of the layer before; the first ``size`` units are the inputs.
+
+    ``units`` ends with room for as many numbers as the widest layer but the last has, inputs being one.
+
+    A sum begins with b and adds the inputs that are not zero in their order, each product rounded before it is added.
 
     Returns:
         The index of the first output in ``units``.
     """
-    hidden, begin, weights = int(parameters[HIDDEN]), 0, WIDTHS + int(parameters[HIDDEN]) + 1
+    hidden, begin, weights = int(parameters[HIDDEN]), 0, 0
+    numbers = parameters[WIDTHS + hidden + 1 :].view(np.float32)
     for layer in range(hidden + 1):
         width = int(parameters[WIDTHS + layer])
-        sums = units[begin + size : begin + size + width]
-        for o in range(width):
-            sums[o] = parameters[weights + size * width + o]
-        for i in range(size):
-            if units[begin + i] != 0:
-                add(sums, units[begin + i], parameters, weights + i * width)
-        if layer < hidden:
+        above, sums = units[begin : begin + size], units[begin + size : begin + size + width]
+        bias = numbers[weights + size * width :]
+        for o in range(np.uint64(width)):
+            sums[o] = bias[o]
+        count, live = 0, units[len(units) - size :]
+        for i in range(np.uint64(size)):  # without a branch, which half of the units would mispredict
+            live[np.uint64(count)] = np.int32(i).view(np.float32)
+            count += 1 if above[i] != 0 else 0
+        fours = count - count % 4
+        for k in range(0, fours, 4):
+            add_four(sums, above, numbers, weights, live[k : k + 4])
+        for k in range(fours, count):
+            add(sums, above, numbers, weights, live[k])
+        if layer < hidden and parameters[TANH] == 1:
             for o in range(width):
-                sums[o] = math.tanh(sums[o]) if parameters[TANH] == 1 else max(sums[o], 0.0)
+                sums[o] = math.tanh(sums[o])
+        elif layer < hidden:
+            for o in range(np.uint64(width)):
+                sums[o] = max(sums[o], np.float32(0))
         weights += (size + 1) * width
         begin += size
         size = width
     return begin
+
+
+@kernel
+def add(sums: Singles, above: Singles, numbers: Singles, begin: int, live: Any) -> None:
+    """Add a unit times its row of weights to the sums."""
+    i = np.uint64(live.view(np.int32))
+    row = np.uint64(begin + i * len(sums))
+    unit = above[i]
+    for o in range(np.uint64(len(sums))):
+        sums[o] += unit * numbers[row + o]
+
+
+@kernel
+def add_four(sums: Singles, above: Singles, numbers: Singles, begin: int, live: Singles) -> None:
+    """``add`` of four units, in this order: sums are loaded and stored once, which takes most of the time."""
+    n = len(sums)
+    i = np.uint64(live[0].view(np.int32))
+    j = np.uint64(live[1].view(np.int32))
+    k = np.uint64(live[2].view(np.int32))
+    m = np.uint64(live[3].view(np.int32))
+    a, b, c, d = above[i], above[j], above[k], above[m]
+    row_i = np.uint64(begin + i * n)
+    row_j = np.uint64(begin + j * n)
+    row_k = np.uint64(begin + k * n)
+    row_m = np.uint64(begin + m * n)
+    for o in range(np.uint64(n)):
+        x = (sums[o] + a * numbers[row_i + o]) + b * numbers[row_j + o]
+        sums[o] = (x + c * numbers[row_k + o]) + d * numbers[row_m + o]
+
+
+@kernel
+def singles(count: int) -> int:
+    """Entries of a memory or of parameters that hold so many numbers of single precision."""
+    return (count + 1) // 2
 
 
 @kernel
@@ -77,12 +130,10 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     at_arrivals, room = actions > places, has_space(buffer, arrival)
     if room and not at_arrivals:
         return ACCEPT
-    order, cost, units = memory[:places], memory[places : 2 * places], memory[2 * places :]
+    order, cost, units = memory[:places], memory[places : 2 * places], memory[2 * places :].view(np.float32)
     size = _PER_CANDIDATE * places + _QUEUE
     find_candidates(buffer, arrival, order, cost)
     observe_candidates(buffer, arrival, order, cost, units[:size])
-    for i in range(size):
-        units[i] = np.float32(units[i])  # environments show single precision
     outputs = units[forward(parameters, units, size) :]
     best, action = -np.inf, 0
     for a in range(actions):
@@ -136,12 +187,19 @@ class CandidateWeights:
         """Names of the observed fields."""
         return self.SLOT_NAMES + self.CONTEXT_NAMES
 
+    @property
+    def widest(self) -> int:
+        """Numbers of the widest layer but the last, inputs being one."""
+        return max(len(weight) for weight, _ in self.layers)
+
     def parameters(self) -> NDArray[np.float64]:
         """The network as parameters of ``decide``."""
         header = [self.candidates, self.masks, self.activation == "tanh", len(self.layers) - 1]
         widths = [len(bias) for _, bias in self.layers]
-        numbers = [part.reshape(-1) for layer in self.layers for part in layer]
-        return np.concatenate([header, widths, *numbers]).astype(np.float64)
+        numbers = np.concatenate([part.reshape(-1) for layer in self.layers for part in layer], dtype=np.float32)
+        pairs = np.zeros(2 * singles(len(numbers)), "<f4")
+        pairs[: len(numbers)] = numbers  # finite, so that no pair reads as one that is not a number
+        return np.concatenate([header, widths, pairs.view("<f8")]).astype(np.float64)
 
     def tensors(self) -> dict[str, NDArray[np.float32]]:
         """The numbers by name, as in a file."""
@@ -151,9 +209,10 @@ class CandidateWeights:
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights; it works for every L."""
-        units = inputs(self.candidates) + sum(len(bias) for _, bias in self.layers)
+        units = inputs(self.candidates) + sum(len(bias) for _, bias in self.layers) + self.widest
+        work = 2 * (self.candidates + 1) + singles(units), 0
         return Policy(
-            name, on_arrival, weights=tuple(self.parameters().tolist()), work=(2 * (self.candidates + 1) + units, 0),
+            name, on_arrival, weights=tuple(self.parameters().tolist()), work=work,
             compile=True, built_in=True, reads_rate=True, reads_left=True, about=about, source=source,
         )  # fmt: skip
 

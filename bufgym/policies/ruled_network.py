@@ -28,7 +28,7 @@ from bufgym.model.observe import (
     observe_candidates,
 )
 from bufgym.policies import chains, price_dp, target_gap
-from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, forward
+from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
 from bufgym.policies.guided import (
     BASE,
     INPUT_FIELDS,
@@ -86,14 +86,14 @@ def even(buffer: Buffer, memory: Memory) -> bool:
 
 
 @kernel
-def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float64], places: int) -> None:
-    """Write into ``own`` order and cost of the ``places`` = k + 1 candidates, each action's decision, and what is seen.
+def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: Memory, numbers: Singles, places: int) -> None:
+    """Write what is seen into ``numbers``.
 
-    ``memory`` begins with the rule's, which is updated.
+    Order and cost of the ``places`` = k + 1 candidates and each action's decision go into ``own``. ``memory`` begins
+    with the rule's, which is updated.
     """
     actions = places + 2
     order, cost, decisions = own[:places], own[places : 2 * places], own[2 * places : 2 * places + actions]
-    numbers = own[2 * places + actions :]
     of_candidates = PER_CANDIDATE * places + QUEUE
     room = has_space(buffer, arrival)
     recall(buffer, arrival, memory, BASE)
@@ -110,16 +110,14 @@ def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float
         if not alone and is_offered(order, True, room, a):
             decisions[a] = decision_of_candidate(order, len(buffer.slots), True, room, a)
             numbers[at + 2 + a] = 1.0 if decisions[a] == by_rule else 0.0
-    for i in range(at + 1 + actions):
-        numbers[i] = np.float32(numbers[i])  # a network learns from single precision
 
 
 @kernel
 def decide(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.float64], places: int) -> int:
     """The decision with the highest output."""
     parameters, actions = buffer.parameters, places + 2
-    look(buffer, arrival, memory, own, places)
-    decisions, units = own[2 * places : 2 * places + actions], own[2 * places + actions :]
+    decisions, units = own[2 * places : 2 * places + actions], own[2 * places + actions :].view(np.float32)
+    look(buffer, arrival, memory, own, units, places)
     outputs = units[forward(parameters, units, seen(places - 1)) :]
     best, decision = -np.inf, 0
     for a in range(actions):
@@ -132,10 +130,12 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, own: NDArray[np.flo
 def own_numbers(parameters: NDArray[np.float64]) -> int:
     """How much of the memory's end the network takes."""
     places = int(parameters[CANDIDATES]) + 1
-    total = 3 * places + 2 + seen(places - 1)
+    units = widest = seen(places - 1)
     for layer in range(int(parameters[HIDDEN]) + 1):
-        total += int(parameters[WIDTHS + layer])
-    return total
+        units += int(parameters[WIDTHS + layer])
+        if layer < int(parameters[HIDDEN]):
+            widest = max(widest, int(parameters[WIDTHS + layer]))
+    return 3 * places + 2 + singles(units + widest)
 
 
 def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
@@ -147,22 +147,29 @@ def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
 def watch_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """What gap-price does; the memory ends with each action's decision and what the network would see."""
     places = int(buffer.parameters[CANDIDATES]) + 1
-    own = memory[len(memory) - (3 * places + 2 + seen(places - 1)) :]
-    look(buffer, arrival, memory, own, places)
+    own = memory[len(memory) - (3 * places + 2 + singles(seen(places - 1))) :]
+    look(buffer, arrival, memory, own, own[3 * places + 2 :].view(np.float32), places)
     return int(own[3 * places + 1])
 
 
 def watcher(candidates: int) -> Policy:
     """The rule gap-price, which leaves in its memory what a network with so many candidates would see.
 
-    The memory ends with the decisions of all actions, float64[k + 3], and what is seen, float64[seen(k)].
+    ``watched`` reads it.
     """
     places = candidates + 1
-    work = chains.SCRATCH[0] + 3 * places + 2 + seen(candidates), chains.SCRATCH[1]
+    work = chains.SCRATCH[0] + 3 * places + 2 + singles(seen(candidates)), chains.SCRATCH[1]
     return Policy(
         "watcher", watch_arrival, weights=(float(candidates), 1.0, 1.0, 0.0, 0.0), memory=REMEMBERED, work=work,
         compile=True, built_in=True, reads_rate=True, reads_left=True,
     )  # fmt: skip
+
+
+def watched(memory: Memory, candidates: int) -> tuple[NDArray[np.float64], Singles]:
+    """(Decisions of all actions, float64[..., k + 3]; what is seen, float32[..., seen(k)]) of the watcher."""
+    numbers = memory.shape[-1] - singles(seen(candidates))
+    decisions = memory[..., numbers - (candidates + 3) : numbers]
+    return decisions, memory[..., numbers:].view(np.float32)[..., : seen(candidates)]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from weight_cases import random_choices
 
 from bufgym.model.buffer import ACCEPT, REJECT
-from bufgym.policies.candidate_network import CandidateWeights, inputs
+from bufgym.policies.candidate_network import CandidateWeights, forward, inputs
 from bufgym.policies.registry import Policy
 
 kernels = pytest.mark.kernels
@@ -62,6 +62,31 @@ def test_it_decides_as_the_reference_model(case, v, made):
     slow = case.run(reference(made, margins), v)
     assume(min(margins, default=1.0) > 1e-3)
     assert same(case.run(made.policy("fast"), v), slow)
+
+
+def numpys(made, seen):
+    """Outputs by numpy, whose products and sums are rounded to single precision one after another."""
+    h = seen
+    for layer, (weight, bias) in enumerate(made.layers):
+        sums = bias
+        for unit, row in zip(h, weight, strict=True):
+            sums = sums + unit * row if unit else sums
+        if layer < len(made.layers) - 1:
+            sums = np.maximum(sums, np.float32(0)) if made.activation == "relu" else [math.tanh(x) for x in sums]
+        h = np.float32(sums)
+    return h
+
+
+@kernels
+@given(made=networks(), seed=st.integers(0, 2**32))
+def test_outputs_are_numpys_bit_for_bit(made, seed):
+    rng, size = np.random.default_rng(seed), inputs(made.candidates)
+    seen = rng.normal(size=size).astype(np.float32) * (rng.random(size) < 0.7)
+    units = np.zeros(size + sum(len(bias) for _, bias in made.layers) + made.widest, np.float32)
+    units[:size] = seen
+    expected = numpys(made, seen)
+    first = forward(made.parameters(), units, size)
+    assert units[first : first + len(expected)].tobytes() == expected.tobytes()
 
 
 def test_a_network_without_hidden_layers_by_hand():

@@ -17,7 +17,7 @@ from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import guided, target_gap, thinning, weights
 from bufgym.policies.registry import Policy
-from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watcher
+from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watched, watcher
 from bufgym.scenario import Episode, messages
 
 kernels = pytest.mark.kernels
@@ -107,7 +107,7 @@ def test_the_watcher_is_the_rule_and_leaves_in_its_memory_what_the_network_sees(
 
     def on_arrival(buffer, arrival, memory):
         decision = watcher(k).on_arrival(buffer, arrival, memory)
-        does, numbers = memory[-(k + 3) - seen(k) : -seen(k)], memory[-seen(k) :]
+        does, numbers = watched(memory, k)
         same_as_rule = numbers[-(k + 2) :].tolist()
         assert does[-1] == decision
         assert same_as_rule == [float(d == decision and d != NOT_OFFERED) for d in does[:-1].tolist()]
@@ -152,7 +152,7 @@ def test_on_a_link_that_has_been_even_for_three_seconds_the_rule_alone_is_offere
 
         def on_arrival(buffer, arrival, memory, offered=offered):
             watcher(2).on_arrival(buffer, arrival, memory)
-            actions = memory[-5 - seen(2) : -seen(2)]
+            actions, _ = watched(memory, 2)
             offered.append((int(arrival.arrival_us), bool((actions[:-1] == NOT_OFFERED).all())))
             return int(actions[-1])
 
