@@ -88,6 +88,7 @@ class SubEnvs:
         self._threads = Threads(np.arange(n), options.num_threads)
         self._again = [Repeated() for _ in self._threads.parts]
         self._begin = Repeated()
+        self._begun: dict[int, NDArray[np.int64]] = {}  # length -> rows that begin an episode
         self._actions = np.zeros(n, np.int64)
 
         self.choices = None
@@ -173,7 +174,10 @@ class SubEnvs:
 
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
-        self._run(self._begin, self._load(rows, episodes), NO_ACTIONS)
+        loaded = self._load(rows, episodes)
+        same = self._begun.setdefault(len(loaded), loaded)  # a call is repeated with the same arrays
+        same[:] = loaded
+        self._run(self._begin, same, NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
             if self._regret is not None:
@@ -183,7 +187,10 @@ class SubEnvs:
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every sub-environment; the result is in ``self.output``."""
         self._actions[:] = actions
-        self._threads.each(lambda part, rows: self._run(self._again[part], rows, self._actions))
+        if len(self._again) == 1:
+            self._run(self._again[0], self._threads.parts[0], self._actions)
+        else:
+            self._threads.each(lambda part, rows: self._run(self._again[part], rows, self._actions))
         if self._has_own:
             self._own_terms.write(self.senders.batch, self.output)
             if self._regret is not None:
@@ -191,7 +198,7 @@ class SubEnvs:
             self._own_fields.write(self.senders.batch, self.output)
 
     def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
-        """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step.
+        """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step, in an array of its own.
 
         An episode may be a dict of arguments for ``numbered``.
         """
@@ -212,7 +219,7 @@ class SubEnvs:
         self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
-        return rows
+        return rows.copy()
 
     def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         call(step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)

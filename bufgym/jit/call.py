@@ -4,7 +4,6 @@ import contextlib
 import ctypes
 import functools
 import inspect
-import operator
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from bufgym.jit.way import JIT, WAY, C
 from bufgym.kernels.kinds import KernelError, Pointer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_key_of: Callable[[Any], Any] | None = None
 _here = threading.local()
 """Whether this thread runs a kernel in Python, whose calls of others stay in Python."""
 
@@ -32,6 +32,15 @@ def in_python() -> Iterator[None]:
         _here.python = before
 
 
+def _values_key() -> Callable[[Any], Any]:
+    """``values.key_of``, which is imported with the first call and then kept: an import takes as long as the call."""
+    global _key_of
+    from bufgym.jit.values import key_of
+
+    _key_of = key_of
+    return key_of
+
+
 def _readable(value: Any) -> Any:
     """A value whose records are read by attributes in plain Python."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
@@ -44,38 +53,20 @@ def _readable(value: Any) -> Any:
 class Call:
     """One call of a kernel, ready to be made again and again: of C, the same arrays and the same numbers."""
 
-    plain: Callable[[], Any] | None = None
-    """The call of C alone, where it gives nothing back."""
+    __slots__ = "_address", "_arguments", "_code", "_copies", "_function", "_kept", "_words"
 
     def __init__(self, code: Any, function: Any, arguments: tuple[Any, ...]) -> None:
         self._code, self._function, self._arguments = code, function, arguments
         if code is not None:
-            from bufgym.jit.values import struct_of, words
+            self._words, self._kept, self._copies = code.words(arguments)
+            self._address = ctypes.addressof(self._words)
 
-            kept: list[Any] = []
-            self._words = struct_of(code.kinds, False, code.result)(*words(code.kinds, arguments, kept))
-            self._kept, self._address, self._run = kept, ctypes.addressof(self._words), code.run
-            self._copies = [pair for pair in kept if isinstance(pair, tuple)]
-            if not self._copies and code.result is None and WAY == C:
-                # Nothing to look at afterwards. The words live as long as the partial does.
-                self.plain = functools.partial(code.run, self._address)
-                cast(Any, self.plain).words, cast(Any, self.plain).kept = self._words, {-1: kept}
-
-    def put(self, k: int, before: Any, now: Any) -> bool:
-        """Take another value for the k-th argument; False if it must be prepared as a whole."""
-        from bufgym.jit.values import fields, key_of, words
-
-        if self.plain is None or isinstance(now, Hook) or key_of(before) != key_of(now):
-            return False
-        kinds, kept = self._code.kinds, list[Any]()
-        made = words(kinds[k : k + 1], (now,), kept)
-        if any(isinstance(one, tuple) for one in kept):
-            return False
-        first = sum(len(fields(kind, False)) for kind in kinds[:k])
-        for j, word in enumerate(made, first):
-            setattr(self._words, f"w{j}", word)
-        cast(Any, self.plain).kept[k] = kept
-        return True
+    @property
+    def plain(self) -> Callable[[], Any] | None:
+        """The call of C alone, where there is nothing to look at afterwards."""
+        if self._code is None or self._copies or self._code.result is not None or WAY != C:
+            return None
+        return functools.partial(self._code.run, self._address)
 
     def __call__(self) -> Any:
         """Make the call; return the kernel's result."""
@@ -84,17 +75,16 @@ class Call:
                 return self._function(*map(_readable, self._arguments))
         for copy, array in self._copies:
             copy[...] = array
-        fault = self._run(self._address)
+        code = self._code
+        fault = code.run(self._address)
         for copy, array in self._copies:
             if array.flags.writeable:
                 array[...] = copy
         if fault:
             raise KernelError(fault.decode())
-        if self._code.result is None:
+        if code.result is None:
             return None
-        from bufgym.jit.values import value_of
-
-        return value_of(self._code.result, self._words.result)
+        return self._words.result if code.gives_number else code.value_of(self._words.result)
 
 
 class Kernel:
@@ -104,6 +94,7 @@ class Kernel:
         functools.update_wrapper(self, function)
         self.py_func = function
         self._codes: dict[Any, Any] = {}
+        self._arguments = cast(Any, function).__code__.co_argcount
 
     def __call__(self, *arguments: Any, **named_ones: Any) -> Any:
         """Call it; its code is looked up, or made, at the first call with arguments of such kinds."""
@@ -113,7 +104,7 @@ class Kernel:
 
     def bound(self, *arguments: Any, **named_ones: Any) -> Call:
         """The call with these arguments, to be made later, and more than once."""
-        if named_ones or len(arguments) != cast(Any, self.py_func).__code__.co_argcount:
+        if named_ones or len(arguments) != self._arguments:
             signature = inspect.signature(self.py_func).bind(*arguments, **named_ones)
             signature.apply_defaults()
             arguments = signature.args
@@ -121,22 +112,23 @@ class Kernel:
 
     def code(self, arguments: tuple[Any, ...], ready: bool = False) -> Any:
         """The code for arguments of such kinds; None where it runs as Python, or, if it must be ``ready``, is not."""
+        key = tuple(map(_key_of or _values_key(), arguments))
+        return self._codes[key] if key in self._codes else self._found(key, arguments, ready)
+
+    def _found(self, key: Any, arguments: tuple[Any, ...], ready: bool) -> Any:
         from bufgym.jit import code
-        from bufgym.jit.values import annotated, key_of, kind_of
+        from bufgym.jit.values import annotated, kind_of
 
         # One without an address must not meet the code for those that have one.
         if code.noted is None and any(isinstance(a, Hook) and a.address is None for a in arguments):
             return None
-        key = tuple(map(key_of, arguments))
-        if key not in self._codes:
-            hints = inspect.get_annotations(self.py_func)
-            names = cast(Any, self.py_func).__code__.co_varnames
-            kinds = tuple(annotated(kind_of(a), hints.get(n)) for a, n in zip(arguments, names, strict=False))
-            found = code.entry(self.py_func, kinds, ready)
-            if found is None and ready:
-                return None
+        hints = inspect.get_annotations(self.py_func)
+        names = cast(Any, self.py_func).__code__.co_varnames
+        kinds = tuple(annotated(kind_of(a), hints.get(n)) for a, n in zip(arguments, names, strict=False))
+        found = code.entry(self.py_func, kinds, ready)
+        if found is not None or not ready:
             self._codes[key] = found
-        return self._codes[key]
+        return found
 
     def __repr__(self) -> str:
         return f"<kernel {self.py_func.__module__}.{self.py_func.__qualname__}>"
@@ -148,10 +140,11 @@ class Hook:
     def __init__(self, function: Callable[..., Any], pointer: Pointer) -> None:
         functools.update_wrapper(self, function)
         function = getattr(function, "py_func", function)
-        self.py_func, self.kind, self.key = function, pointer, str(pointer)
         from bufgym.jit.code import address
 
+        self.py_func, self.kind = function, pointer
         self.address: int | None = address(function, pointer)
+        self.key = str(pointer) if self.address is not None else f"{pointer} without an address"
         self._kernel = Kernel(function)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -172,42 +165,33 @@ def compile_signature(kinds: Pointer | None, function: Function) -> Function:
 class Repeated:
     """Calls of a kernel with mostly the same arguments: to look at all arrays takes longer than most kernels run.
 
-    A copy, or one in another process, looks at them anew.
+    It remembers the last ``MOST`` calls, as results go into a few arrays in turn. A copy of it, or one in another
+    process, remembers none.
     """
 
+    MOST = 16
+
     def __init__(self) -> None:
-        self._function: Any = None
-        self._arguments: tuple[Any, ...] = ()
-        self._call: Any = None
-        self._run: Callable[[], Any] = tuple
+        self._calls: dict[tuple[int, ...], tuple[Any, Callable[[], Any]]] = {}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Repeated, ()
 
     def __call__(self, function: Any, *arguments: Any) -> Any:
-        """``function(*arguments)``; only arguments that are other objects than the last time are looked at."""
-        if function is not self._function or any(map(operator.is_not, arguments, self._arguments)):
-            self._take(function, arguments)
-        return self._run()
+        """``function(*arguments)``; arguments that were the same objects in one of the last calls are not looked at."""
+        key = tuple(map(id, arguments))
+        call = self._calls.get(key)
+        return call[1]() if call is not None and call[0][0] is function else self._new(key, function, arguments)()
 
-    def _take(self, function: Any, arguments: tuple[Any, ...]) -> None:
-        """Prepare the call with these arguments."""
-        before = self._arguments
-        known, self._function = self._function, None  # whatever fails now: the next call looks at all again
-        if (
-            self._call is None
-            or function is not known
-            or not all(
-                one is other or self._call.put(k, one, other)
-                for k, (one, other) in enumerate(zip(before, arguments, strict=True))
-            )
-        ):
-            if isinstance(function, Kernel) and not getattr(_here, "python", False):
-                self._call = function.bound(*arguments)
-                self._run = self._call.plain or self._call
-            else:
-                self._call, self._run = None, functools.partial(function, *arguments)
-        self._function, self._arguments = function, arguments
+    def _new(self, key: tuple[int, ...], function: Any, arguments: tuple[Any, ...]) -> Callable[[], Any]:
+        if not isinstance(function, Kernel) or getattr(_here, "python", False):
+            return functools.partial(function, *arguments)
+        call = function.bound(*arguments)
+        while len(self._calls) >= self.MOST:
+            del self._calls[next(iter(self._calls))]
+        # The call owns what C reads; arguments that are kept share their address with no other object.
+        self._calls[key] = (function, arguments, call), call.plain or call
+        return self._calls[key][1]
 
 
 def say_once(text: str) -> None:

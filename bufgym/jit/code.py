@@ -24,10 +24,10 @@ from typing import Any
 from bufgym.jit.call import say_once
 from bufgym.jit.fingerprint import fingerprint
 from bufgym.jit.folder import FOLDER
-from bufgym.jit.values import NotNumbersError, read, spelled
+from bufgym.jit.values import NotNumbersError, read, spelled, struct_of, value_of, words
 from bufgym.jit.way import CHECKED, WAY
 from bufgym.kernels.compiler import HINT, find, library_suffix
-from bufgym.kernels.kinds import Given, Kind, Pointer, Tuple
+from bufgym.kernels.kinds import Given, Kind, Number, Pointer, Tuple
 from bufgym.utils.files import PACKAGE, replaced
 
 BUILT = PACKAGE / "kernels" / "built"
@@ -46,6 +46,18 @@ class Code:
     run: Callable[[int], bytes | None]
     kinds: tuple[Kind, ...]
     result: Kind
+    struct: Any
+    gives_number: bool
+
+    def words(self, arguments: tuple[Any, ...]) -> tuple[Any, list[Any], list[Any]]:
+        """(The struct of the arguments, what it points to, (copy, array) of arrays that were copied)."""
+        kept: list[Any] = []
+        made = self.struct(*words(self.kinds, arguments, kept))
+        return made, kept, [pair for pair in kept if isinstance(pair, tuple)] if kept else kept
+
+    def value_of(self, found: Any) -> Any:
+        """The result in C as a value of Python."""
+        return value_of(self.result, found)
 
 
 def name_of(function: Any, kinds: Any) -> str:
@@ -101,7 +113,8 @@ def entry(function: Any, kinds: tuple[Kind, ...], ready: bool = False) -> Code |
     run = getattr(library, symbol)
     run.argtypes, run.restype = [ctypes.c_void_p], ctypes.c_char_p
     gives = ctypes.c_char_p.in_dll(library, f"{symbol}_gives").value or b""
-    return Code(run, kinds, read(gives.decode()))
+    result = read(gives.decode())
+    return Code(run, kinds, result, struct_of(kinds, False, result), isinstance(result, Number))
 
 
 def address(function: Any, pointer: Pointer) -> int | None:

@@ -5,6 +5,7 @@ Arrays are the same memory, so their owner keeps them alive during a call. Tuple
 
 import ctypes
 import functools
+import sys
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any
@@ -111,6 +112,18 @@ def struct_of(kinds: tuple[Kind, ...], inside: bool, result: Kind = None) -> Any
     return type("Struct", (ctypes.Structure,), {"_fields_": named or [("none", ctypes.c_char)]})
 
 
+def _read_address(array: Any) -> int:
+    """Where an array's numbers begin: NumPy's C interface has that behind an object's head. In .15 us, not .9."""
+    return ctypes.c_void_p.from_address(id(array) + _HEAD).value or 0
+
+
+_HEAD = object.__basicsize__
+_probe = np.zeros(1)
+address_of: Callable[[Any], int] = _read_address
+if sys.implementation.name != "cpython" or _read_address(_probe) != _probe.ctypes.data:
+    address_of = lambda array: array.ctypes.data  # noqa: E731
+
+
 def words(kinds: tuple[Kind, ...], values: Any, kept: list[Any], inside: bool = False) -> list[Any]:
     """The words of values of these kinds.
 
@@ -118,12 +131,11 @@ def words(kinds: tuple[Kind, ...], values: Any, kept: list[Any], inside: bool = 
     """
     found: list[Any] = []
     for kind, value in zip(kinds, values, strict=True):
-        if isinstance(kind, Array):
+        if type(kind) is Array:
             if not value.flags.c_contiguous:
                 kept.append((np.array(value, order="C"), value))
                 value = kept[-1][0]
-            found.append(value.ctypes.data)
-            found.extend(value.shape)
+            found += address_of(value), *value.shape
         elif isinstance(kind, Number):
             found.append(_CONVERTED[kind](value))
         elif isinstance(kind, Tuple):

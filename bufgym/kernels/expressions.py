@@ -125,6 +125,12 @@ class Expressions(Calls, Subscripts):
         if name == "Div":
             return Value(self.after(before, f"{x} / {y}"), kind)
         if name in ("FloorDiv", "Mod"):
+            of_two = kind is INT and isinstance(other.known, int) and other.known > 0 and other.known.bit_count() == 1
+            if of_two:  # rounds down as it is, in a third of the time: half of a binary search
+                shift = (
+                    f"{x} >> {int(other.known).bit_length() - 1}" if name == "FloorDiv" else f"{x} & {other.known - 1}"
+                )
+                return Value(self.after(before, shift), kind)
             helper = "bg_floor" if name == "FloorDiv" else "bg_mod"
             text = self.tested(helper, x, y, node=node) if kind is INT else f"{helper}_real({x}, {y})"
             return Value(self.after(before, text), kind)

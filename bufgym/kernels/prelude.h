@@ -9,9 +9,11 @@
 #ifdef __GNUC__
 #define BG_KERNEL static inline __attribute__((always_inline))
 #define bg_prefetch(place) __builtin_prefetch(place, 1, 3)
+#define bg_seldom(x) __builtin_expect(x, 0)
 #else
 #define BG_KERNEL static inline
 #define bg_prefetch(place) ((void)0)
+#define bg_seldom(x) (x)
 #endif
 #ifdef _WIN32
 #define BG_EXPORT __declspec(dllexport)
@@ -68,7 +70,7 @@ static inline void bg_divides(int64_t a, int64_t b, const char *where)
 #define BG_RETURNED 0
 #define BG_WHERE
 #define bg_divides(a, b, where) ((void)0)
-static inline int64_t bg_index(int64_t k, int64_t n) { return k < 0 ? k + n : k; }
+static inline int64_t bg_index(int64_t k, int64_t n) { return bg_seldom(k < 0) ? k + n : k; }
 #endif
 
 /* Division rounds down, as in Python; by 0 it gives 0. */
