@@ -13,7 +13,7 @@ from typing import Annotated
 from cyclopts import App
 
 from agents.runs import prepare
-from agents.settings import ALGORITHMS, FLAT, PPO, Hindsight, Settings
+from agents.settings import ALGORITHMS, FLAT, PPO, Hindsight, Settings, Tune
 from bufgym.cli.options import OPTIONS
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked
@@ -25,7 +25,7 @@ app = App(
     error_formatter=lambda said: f"error: {said}",
     suppress_keyboard_interrupt=False,
 )
-BEFORE = {"maskable-ppo": "ppo", "ppo": "ppo", "dqn": "dqn"}
+BEFORE = {"maskable-ppo": "ppo", "ppo": "ppo", "dqn": "dqn", "cma-es": "tune RULE"}
 """A value that ``--algo`` had -> the command that now does it; for others hindsight does."""
 
 
@@ -50,6 +50,18 @@ def add_command(algorithm: type[Settings]) -> None:
 
 for each in ALGORITHMS:
     add_command(each)
+
+
+@app.command(name=Tune.algo)
+def _tune(rule: str, /, *, settings: Annotated[Tune, FLAT] = Tune()) -> None:  # noqa: B008
+    """Search a rule's named numbers by CMA-ES over whole episodes; the result is its name with its settings.
+
+    Args:
+        rule: The policy, as in bench: gap-priority, target-gap, or one that --policy-file registers.
+    """
+    from agents.tuning import tune
+
+    tune(replace(settings, rule=rule))
 
 
 def main(settings: Settings, others: Sequence[Settings] = ()) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from agents.settings import Settings
+from agents.settings import RunSettings, Settings
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked, write_text
 from bufgym.utils.processes import end_with
@@ -23,7 +23,6 @@ RUNS = Path("runs")
 MODEL = "model.safetensors"
 """The file of an agent whose weights bufgym runs without torch."""
 FREE = {"command", "name", "resume", "steps", "checkpoint_every", "validate_every", "episodes", "seeds"}
-FREE |= {"cluster", "backend", "address"}
 """Settings that may differ between a run and its resumption."""
 
 Numbers = tuple[float, ...]
@@ -40,7 +39,7 @@ class Run:
     seconds: float
     """Time spent training, over all its sessions, s."""
     curve: list[Numbers]
-    """(steps, seconds, mean QoI of the latest training episodes, or an evolved agent's fitness), a row per update."""
+    """(steps, seconds, mean QoI of the latest training episodes), a row per update."""
     validation: list[Numbers]
     """(steps, seconds, measures), a row per validation; the last measure chooses the agent to keep."""
     file: str = "model.zip"
@@ -64,7 +63,7 @@ class Run:
         return self.reached if self.best is max else -self.reached
 
 
-def prepare(settings: Settings) -> Path:
+def prepare(settings: RunSettings) -> Path:
     """The run's folder: made for a new run, checked against these settings for a resumed one."""
     folder = RUNS / (settings.name or _default_name(settings.resume))
     if settings.resume:
@@ -87,7 +86,7 @@ def prepare(settings: Settings) -> Path:
 
 
 def write_notes(
-    folder: Path, settings: Settings, seeds: Sequence[int], scores: Mapping[str, Any] | None = None
+    folder: Path, settings: RunSettings, seeds: Sequence[int], scores: Mapping[str, Any] | None = None
 ) -> None:
     """Write notes.json, from which ``bufgym export`` describes the model in this folder."""
     notes: dict[str, Any] = {"training": settings.command, "seeds": list(seeds)}
@@ -176,7 +175,7 @@ class Validations:
     """
 
     def __init__(
-        self, home: Path, columns: tuple[str, ...], best: Callable[..., Any], settings: Settings, steps: int
+        self, home: Path, columns: tuple[str, ...], best: Callable[..., Any], settings: RunSettings, steps: int
     ) -> None:
         self.settings, self.columns, self.choose = settings, columns, best
         self.record = Record(home / "validation.csv", ("steps", "seconds", *columns), steps)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from cyclopts import Parameter
 
-from agents.tasks import Environment, Families, Kind, Suites
+from agents.tasks import Environment, Families, Kind, Names, Place, Suites
 from bufgym.cli.options import Count, Least0, Natural, Positive, checked, command_line
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.utils.errors import BufgymError
@@ -23,68 +23,25 @@ Share = Annotated[float, checked(float, lambda number: 0 <= number <= 1, "a numb
 
 
 @dataclass(frozen=True)
-class Cluster:
-    """Where candidates are evaluated instead of the seed's process."""
-
-    backend: Literal["ray", "dask"]
-    """Evaluate the candidates on a Ray or Dask cluster, with the same result. Its workers must be able to import bufgym
-    and agents."""
-    address: str | None = None
-    """Of the cluster's head, such as tcp://host:8786; by default a cluster on this machine is begun and ended."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What all algorithms share."""
+class RunSettings:
+    """What all runs share."""
 
     algo: ClassVar[str]
     """The command of ``train.py``, which names the agents in tables too."""
-    learner: ClassVar[str]
-    """Its ``agents.learner.Learner`` as module:class, imported once the settings are known to be good."""
-    kinds: ClassVar[tuple[Kind, ...]] = ("environment",)
-    """The tasks it can learn."""
     steps: Natural
     validate_every: Natural = 0
     """Steps; 0: a sixth of them."""
-    validation_episodes: Natural = 0
-    """About so many in each validation, over all scenarios and capacities; 0: 300, or 6 for each link of topics and 4
-    for each of a fleet."""
-    environment: Annotated[Environment, FLAT] = Environment()
-    suites: Annotated[Suites, FLAT] = Suites()
     name: str = ""
     """Folder under runs/; by default the next free one (with --resume: the last one) of train-1, train-2, ..."""
     resume: bool = False
     """Go on from the run's last checkpoint."""
-    seeds: Count = 1
-    """Train this many agents, each in a process of its own."""
     seed: Seed = 0
     """The first seed."""
-
-    def __post_init__(self) -> None:
-        if self.suites.suite and self.environment != type(self.environment)():
-            raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
-        if self.kind not in self.kinds:
-            known = ", ".join(each.algo for each in ALGORITHMS if self.kind in each.kinds)
-            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind; these do: {known}")
-
-    @property
-    def on(self) -> Environment | Suites:
-        """What it trains on."""
-        return self.suites if self.suites.suite else self.environment
-
-    @property
-    def kind(self) -> Kind:
-        """The task of the run."""
-        return self.on.kind
 
     @property
     def every(self) -> int:
         """Steps between validations."""
         return self.validate_every or -(-self.steps // 6)
-
-    def validations(self, usual: int = VALIDATIONS, cells: int = 1) -> int:
-        """Episodes of a validation in each of so many cells."""
-        return max(1, round(self.validation_episodes / cells)) if self.validation_episodes else usual
 
     @property
     def values(self) -> dict[str, Any]:
@@ -97,23 +54,69 @@ class Settings:
     @property
     def command(self) -> str:
         """The command that trains it again, with all settings that differ from the defaults."""
-        usual = {"backend": None, "address": None, **type(self)().values}  # type: ignore[call-arg]
-        here = ("name", "resume", "backend", "address")
-        changed = {name: value for name, value in self.values.items() if name not in here and value != usual[name]}
+        usual = type(self)().values  # type: ignore[call-arg]
+        changed = {name: v for name, v in self.values.items() if name not in ("name", "resume") and v != usual[name]}
         return command_line(f"python train.py {self.algo}", **changed)
 
 
 @dataclass(frozen=True)
-class Evolve(Settings):
-    """Evolve an agent by CMA-ES over whole episodes, on the numbers of a rule, for topics or a fleet (--suite)."""
+class Settings(RunSettings):
+    """What all algorithms share."""
 
-    algo = "evolve"
-    learner = "agents.cma_es:Evolution"
-    kinds = ("topics", "fleet")
-    suites: Annotated[Suites, FLAT] = Suites(("topics-v1",))
-    steps: Natural = 40_000_000
-    """Decisions to learn from, for each seed."""
-    cluster: Annotated[Cluster | None, FLAT] = None
+    learner: ClassVar[str]
+    """Its ``agents.learner.Learner`` as module:class, imported once the settings are known to be good."""
+    kinds: ClassVar[tuple[Kind, ...]] = ("environment",)
+    """The tasks it can learn."""
+    validation_episodes: Natural = 0
+    """About so many in each validation, over all scenarios and capacities; 0: 300, or 4 for each link of a fleet."""
+    environment: Annotated[Environment, FLAT] = Environment()
+    suites: Annotated[Suites, FLAT] = Suites()
+    seeds: Count = 1
+    """Train this many agents, each in a process of its own."""
+
+    def __post_init__(self) -> None:
+        if self.suites.suite and self.environment != type(self.environment)():
+            raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
+        if self.kind not in self.kinds:
+            known = ", ".join(each.algo for each in ALGORITHMS if self.kind in each.kinds) or "tune RULE --on SUITE"
+            raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind; these do: {known}")
+
+    @property
+    def on(self) -> Environment | Suites:
+        """What it trains on."""
+        return self.suites if self.suites.suite else self.environment
+
+    @property
+    def kind(self) -> Kind:
+        """The task of the run."""
+        return self.on.kind
+
+    def validations(self, usual: int = VALIDATIONS, cells: int = 1) -> int:
+        """Episodes of a validation in each of so many cells."""
+        return max(1, round(self.validation_episodes / cells)) if self.validation_episodes else usual
+
+
+@dataclass(frozen=True)
+class Tune(RunSettings):
+    """Search a rule's named numbers by CMA-ES over whole episodes; the result is its name with its settings."""
+
+    algo = "tune"
+    rule: Annotated[str, Parameter(parse=False)] = ""
+    """The policy, as in bench."""
+    parameters: Names = ()
+    """Search these alone, as in pace,discount (default: all)."""
+    steps: Natural = 100_000_000
+    """Decisions to search by; a rule takes .1 to .6 us for each."""
+    place: Annotated[Place, FLAT] = Place()
+    policy_file: str | None = None
+    """Python file that registers policies of your own; its code is run, so use only files you trust."""
+
+    @property
+    def command(self) -> str:
+        """The command that searches again."""
+        return (
+            super().command.replace("train.py tune", f"train.py tune {self.rule}").replace(f" --rule {self.rule}", "")
+        )
 
 
 @dataclass(frozen=True)
@@ -286,5 +289,5 @@ class Hindsight(Settings):
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (Evolve, PPO, DQN, FleetPPO, Hindsight)
+ALGORITHMS: tuple[type[Settings], ...] = (PPO, DQN, FleetPPO, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""

@@ -43,8 +43,8 @@ class Suites:
 
     suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
-    validation split, and report on its test split. Several, as in a,b: on all of them at once. A suite of many topics
-    (topics-v1) makes a scheduler, one of a fleet (fleet-v1) an agent that all its robots share."""
+    validation split, and report on its test split. Several, as in a,b: on all of them at once. A suite of a fleet
+    (fleet-v1) makes an agent that all its robots share."""
     data: str | None = None
     """Folder of recordings, for suites that need one."""
     capacities: Capacities = ()
@@ -109,3 +109,19 @@ class Families:
     def names(self) -> tuple[str, ...]:
         """The families, each once."""
         return FAMILY_NAMES if ALL in self.families else tuple(dict.fromkeys(self.families))
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a rule is tuned on."""
+
+    on: str = "lte"
+    """A scenario or a suite: a name (bufgym list), with parameters as in lte:rate_hz=5, or a client's .toml."""
+    workload: str | None = None
+    """A recording of a robot's messages in place of the scenario's stream, as in bench."""
+    trace: Names = ()
+    """Bandwidth traces for it, as in bench (default: shipped LTE)."""
+    data: str | None = None
+    """Folder of recordings, for suites that need one."""
+    capacity: Capacities = ()
+    """L, such as 5,10,25 (default: 8, with topics 32, or the suite's)."""

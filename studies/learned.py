@@ -18,7 +18,7 @@ from agents.families import Family, Run
 from agents.tasks import FAMILY_NAMES, Names
 from bufgym import policies
 from bufgym.policies import Policy, weights
-from bufgym.policies.guided import N_INPUTS
+from bufgym.policies.rule_inputs import N_INPUTS
 from bufgym.policies.ruled_network import EVEN_US, PER_CANDIDATE, QUEUE, RuledWeights
 from bufgym.utils.errors import BufgymError
 from studies.families import families
@@ -46,8 +46,8 @@ the rule `gap-price`. It was made by `{command}`{seed}.
 
 - *Sees* the {k} candidates that are cheapest to drop and the head, each by {per_candidate} numbers, and {queue} numbers
   of queue and link (`bufgym.model.observe.candidates`). Beside these it sees the rule's {rule} inputs
-  (`bufgym.policies.guided.INPUTS`), whether there is room, log(L / 8), and which actions are the rule's: {seen} numbers
-  in all. Where there is no odometry, x is the frame's index.
+  (`bufgym.policies.rule_inputs.INPUTS`), whether there is room, log(L / 8), and which actions are the rule's: {seen}
+  numbers in all. Where there is no odometry, x is the frame's index.
 - *Does* one of {actions} actions: accept, or drop the cheapest where there is no room; drop one of the candidates or
   the head; do what `gap-price` does. It is asked at every arrival, and takes the action with the highest output among
   the actions that are offered.

@@ -45,7 +45,7 @@ from studies.page import command
 
 ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
 TOPICS = "bufgym/Topics-v0"
-SCHEDULER = "learned-scheduler"
+SCHEDULER = "gap-priority"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")
 NATIVE = "vector_entry_point"
 SEED = 1

@@ -8,7 +8,7 @@ import pytest
 
 from agents import mixed_env, runs
 from agents.evaluation import EvaluationSet, sweep_for
-from agents.settings import Evolve, Hindsight
+from agents.settings import Hindsight, Tune
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.run import run as rows_of
@@ -100,7 +100,7 @@ def test_a_record_goes_on_where_the_checkpoint_was(tmp_path: Path) -> None:
 
 
 def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
-    validations = runs.Validations(tmp_path, ("regret",), min, Evolve(steps=40, validate_every=20), 0)
+    validations = runs.Validations(tmp_path, ("regret",), min, Tune(steps=40, validate_every=20), 0)
     assert validations.due(0)
     best = [validations.add(steps, 0.0, (regret,)) for steps, regret in ((0, 0.5), (20, 0.4), (30, 0.4))]
     assert best == [True, True, False] and validations.best[0] == 20
@@ -155,7 +155,7 @@ def test_its_weights_serve_other_v_and_l(name: str) -> None:
 @pytest.mark.nightly
 def test_on_the_first_test_episode_of_each_setting_the_scheduler_is_above_robofleet() -> None:
     """Weighted QoI is larger; the first topics no older; no message lost that may not be."""
-    names, settings = ("learned-scheduler", "robofleet"), suites.get("topics-v1").settings("test")
+    names, settings = ("gap-priority", "robofleet"), suites.get("topics-v1").settings("test")
     rivals = [policies.get(name) for name in names]
     ages = dict.fromkeys(names, 0.0)
     for label, setting in settings.items():
@@ -165,4 +165,4 @@ def test_on_the_first_test_episode_of_each_setting_the_scheduler_is_above_robofl
         assert sum(row["lost"] for row in ours if row["no_drop"]) == 0
         for row in rows:
             ages[row["policy"]] += row["mean_age_s"] * (row["priority"] == 20)
-    assert ages["learned-scheduler"] < ages["robofleet"]
+    assert ages["gap-priority"] < ages["robofleet"]

@@ -1,17 +1,16 @@
-"""Agents that a whole fleet shares: where they are tried, where they begin, that a killed run goes on."""
+"""Agents that a whole fleet shares: where they are tried, and that a run goes on."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import train_cases  # noqa: F401  (it skips without the extra)
 
 import train
 from agents.learner import learner_of
 from agents.objectives import fleet
-from agents.settings import Evolve, FleetPPO
+from agents.settings import FleetPPO
 from agents.tasks import Suites
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
@@ -36,7 +35,6 @@ SUITE = dataclasses.replace(FLEET_V1, build=two_robots, capacities=(3, 4))
 TASK = TASKS["fleet"]
 
 ON = Suites(("fleet-v1",), test_seeds=1)
-TINY = Evolve(suites=ON, name="tiny", steps=12_000, validate_every=6_000)
 SMALL = {"num_envs": 4, "n_steps": 32, "batch_size": 64, "width": 8, "epochs": 1, "steps": 256, "validate_every": 128}
 BY_PPO = FleetPPO(suites=ON, name="tiny", **SMALL)  # type: ignore[arg-type]
 
@@ -45,7 +43,6 @@ BY_PPO = FleetPPO(suites=ON, name="tiny", **SMALL)  # type: ignore[arg-type]
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
-    monkeypatch.setattr(fleet, "EPISODE_S", 1.0)
     monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
     monkeypatch.setattr(FleetTask, "default_policies", lambda self, suite: ["afr", "drop-oldest"])
 
@@ -57,37 +54,10 @@ def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:
     mean = TASK.summary(run([policies.get(name) for name in ("afr", "min-gap")], robots, [4], 2)).standings
     assert cell.rival == pytest.approx(mean["afr"]["team"].value)
     assert cell.team_qoi(policies.get("min-gap")) == pytest.approx(mean["min-gap"]["team"].value)
-    gain = fleet.mean_gain(policies.get("min-gap"), [cell])
+    gain = -cell.measure(policies.get("min-gap"))
     assert gain == pytest.approx(mean["min-gap"]["gain"].value) and gain != 0
-    assert fleet.mean_gain(policies.get("afr"), [cell]) == 0  # again and again the same
+    assert cell.measure(policies.get("afr")) == 0  # again and again the same
     assert cell.decisions == 2 * 2 * 60
-
-
-def test_evolution_begins_at_the_rule() -> None:
-    cells = fleet.training_parts(ON, seed=0)[0]
-    mine, rule = fleet.FleetObjective(TINY, Path(), 0).start().policy("mine"), policies.get("gap-price")
-    assert [cell.team_qoi(mine) for cell in cells] == [cell.team_qoi(rule) for cell in cells]
-
-
-@pytest.mark.nightly
-def test_evolution_leaves_the_agent_that_did_best_and_the_rows_of_all(capsys: pytest.CaptureFixture[str]) -> None:
-    train.main(TINY)
-    printed = capsys.readouterr().out
-    folder = Path("runs/tiny")
-    rows = read_rows(folder / "rows.csv", TASK.layout)
-    assert {row["policy"] for row in rows} == {"agent (seed 0)", "afr", "drop-oldest"}
-    assert len(rows) == 12 * 2 * 2 * 3  # links, robots, L, policies
-    assert (folder / "results.txt").read_text() in printed and "best on validation: seed 0" in printed
-    validations = np.loadtxt(folder / "seed-0" / "validation.csv", delimiter=",", skiprows=1)
-    assert validations[0, 0] == 0 and validations[-1, 0] >= TINY.steps and len(validations) >= 3
-    # The file is what the best of these was: it does the same again.
-    agent = weights.load(folder / "model.safetensors")
-    validation = fleet.validation_episodes(TINY)
-    assert fleet.mean_gain(agent, validation) == pytest.approx(validations[:, 2].max(), abs=1e-12)
-    mine = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)"]
-    links = enumerate(by_trace(fleet.fleet_of(ON, "test")))
-    again = [row for k, (_, link) in links for row in run([agent], link, SUITE.capacities, [1000 * k])]
-    assert [row["qoi"] for row in again] == mine
 
 
 @pytest.mark.nightly

@@ -10,6 +10,7 @@ from cli_cases import Patch
 from refusal_cases import refuse
 from test_train import LEARNERS, ON
 from train_cases import in_a_folder_of_its_own  # noqa: F401
+from weight_cases import random_weights
 
 import train
 from agents import ppo, runs
@@ -19,7 +20,6 @@ from agents.learner import Learner, learner_of
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
-from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.weights import save
 
 
@@ -43,7 +43,7 @@ def test_a_network_is_kept_as_a_policy_that_decides_as_it_does(algo: str) -> Non
 
 @dataclasses.dataclass(frozen=True)
 class Still(Settings):
-    """Keep the rule."""
+    """Keep the start."""
 
     algo = "still"
     learner = "test_learners:StillTheRule"
@@ -51,11 +51,11 @@ class Still(Settings):
 
 
 class StillTheRule(Learner[Still]):
-    """Learns nothing: its agent is gap-price, with weights of zero."""
+    """Learns nothing: its agent has random weights."""
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> runs.Run:
         home, objective = folder / f"seed-{seed}", self.objective(folder, seed)
-        save(home / runs.MODEL, GuidedWeights(np.zeros(GuidedWeights.SHAPE, np.float32)), self.notes(seed, "still"))
+        save(home / runs.MODEL, random_weights(["rank"]), self.notes(seed, "still"))
         run = runs.Run(seed, home, 0.0, [], [], runs.MODEL, objective.best)
         return dataclasses.replace(run, validation=[(0, 0.0, *objective.validate(self.agent(run)))])
 
@@ -69,7 +69,7 @@ def test_a_new_learner_is_a_class_and_its_settings(monkeypatch: Patch) -> None:
     assert asked == [Still(environment=dataclasses.replace(ON, episodes=200), name="tiny", validation_episodes=2)]
     (run,) = learner_of(asked[0]).train(runs.prepare(asked[0]))
     judges = FixedEpisodes(asked[0].environment, "validation", 2)
-    assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
+    assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.load(run.model))])
     assert policies.load(run.model).name == "still"
 
 

@@ -155,7 +155,7 @@ def test_paths_rates_and_parameters_wherever_text_is_taken(tmp_path: Path) -> No
 def test_results_without_bare_nan(tmp_path: Path) -> None:
     """JSON has no NaN: no regret is null."""
     run: Any = SimpleNamespace(seed=0, seconds=1.0, merit=1.0)
-    settings: Any = SimpleNamespace(algo="evolve", values={})
+    settings: Any = SimpleNamespace(algo="ppo", values={})
     trained = Trained(settings, tmp_path, [run], [])
     scores = [{"policy": name, "qoi": 1.0, "regret": math.nan} for name in [agent_name(run), "drop-oldest"]]
     trained.save(tmp_path, scores=scores, held_out="")

@@ -204,7 +204,7 @@ def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> N
     needed = {
         "sb3_contrib": "sb3_contrib",
         "stable_baselines3": "bufgym.sb3",
-        "cma": "agents.objectives",
+        "cma": "agents.tuning",
         "pettingzoo": "parallel_env",
     }
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():

@@ -17,17 +17,7 @@ from agents.callbacks import Curve, checkpoints
 from agents.held_out import FixedEpisodes
 from agents.learner import learner_of
 from agents.report import verdict
-from agents.settings import (
-    DQN,
-    PPO,
-    Cluster,
-    Environment,
-    Evolve,
-    FleetPPO,
-    Hindsight,
-    SingleDecisions,
-    Suites,
-)  # fmt: skip
+from agents.settings import DQN, PPO, Environment, FleetPPO, Hindsight, SingleDecisions, Suites  # fmt: skip
 from bufgym import policies
 from bufgym.benchmark.rows import read_rows
 from bufgym.policies import registry
@@ -254,16 +244,17 @@ OR_ZERO = ("seed", "steps", "validate-every", "validation-episodes", "gamma", "g
         ("--capacities 5", "are of a suite, which --suite names"),
         ("--env bufgym/Interruption-v0 --size-bytes 5", "its messages have no size"),
         ("dqn --suite fleet-v1", "suite fleet-v1: dqn learns none of this kind"),
-        ("evolve --suite lte-v1", "suite lte-v1: evolve learns none of this kind; these do: ppo, dqn, hindsight"),
-        ("--suite topics-v1", "suite topics-v1: hindsight learns none of this kind; these do: evolve"),
+        ("fleet-ppo --suite lte-v1", "suite lte-v1: fleet-ppo learns none of this kind; these do: ppo, dqn, hindsight"),
+        ("--suite topics-v1", "suite topics-v1: hindsight learns none of this kind; these do: tune RULE --on SUITE"),
         ("fleet-ppo --width 1000", "width = 1000: a file of weights has at most 256 hidden units a layer"),
-        ("fleet-ppo --suite lte-v1", "suite lte-v1: fleet-ppo learns none of this kind"),
         ("ppo --backend dask", "Unknown option: --backend"),
-        ("evolve --backend no", '"no" for --backend. Choose from'),
-        ("evolve --address host:1", "--backend requires"),
+        ("tune no-such", "unknown policy 'no-such'"),
+        ("tune target-gap --on no-such", "unknown scenario 'no-such'"),
+        ("tune target-gap --parameters pase_s", "unknown parameter 'pase_s'"),
         ("--resume --name none", "there is no run in"),
         ("--algo guided --num-envs 8", "type python train.py hindsight, then"),
         ("--suite lte-v1 --algo=maskable-ppo", "type python train.py ppo, then"),
+        ("--algo cma-es", "type python train.py tune RULE, then"),
     ],
 )
 def test_mistakes_end_in_one_line_before_a_folder_is_made(words: str, message: str, capsys: Capsys) -> None:
@@ -275,14 +266,13 @@ def test_mistakes_end_in_one_line_before_a_folder_is_made(words: str, message: s
 
 
 def test_the_command_of_a_run_gives_its_settings_again() -> None:
-    for settings in (TINY, *SUITE.values(), FleetPPO(), Evolve(seeds=2, cluster=Cluster("dask"))):
+    for settings in (TINY, *SUITE.values(), FleetPPO()):
         made: list[Any] = []
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(train, "main", made.append)
             with pytest.raises(SystemExit):
                 train.typed(settings.command.split()[2:])
-        expected = dataclasses.replace(settings, name="")
-        assert made == [dataclasses.replace(expected, cluster=None) if isinstance(expected, Evolve) else expected]
+        assert made == [dataclasses.replace(settings, name="")]
 
 
 def test_without_words_two_ways_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:

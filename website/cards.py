@@ -35,15 +35,7 @@ CARDS = {
         fails="On LTE links, generated links, recorded uplinks and in outages it cannot be told from the rule"
         " `target-gap`; in interruptions, for unequal sizes and on a link that has not varied for three seconds it is"
         " the rule `gap-price`.",
-    ),
-    "learned-scheduler": Card(
-        results="topics.md",
-        decides="what to drop and what to send next, of many topics",
-        sees="the link, and each queued message and its topic: priority, gain, age, size, window",
-        kind="a rule for topics, its numbers linear in nine inputs at every decision; the best seed on validation",
-        limits="trained on the topics of Robofleet's example client",
-        fails="Where n_T is 1 the first topics are older than under `strict-priority`, which loses messages.",
-    ),
+    )
 }
 
 

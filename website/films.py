@@ -111,8 +111,8 @@ def _suite() -> Frames:
 def _topics() -> Frames:
     scenario = get("topics", duration_s=20.0)
     episode = draw(scenario, 0)
-    films = [_rendered_topics(name, episode) for name in ("robofleet", "learned-scheduler")]
-    return _stacked(("robofleet", "learned-scheduler"), films)
+    films = [_rendered_topics(name, episode) for name in ("robofleet", "gap-priority")]
+    return _stacked(("robofleet", "gap-priority"), films)
 
 
 def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:

@@ -1,4 +1,4 @@
-"""What a run of any learner is measured by: a module for one environment, for one queue, topics and a fleet."""
+"""What a run of any learner is measured by: a module for one environment, for one queue and a fleet."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from agents.objectives.families import FamiliesObjective
 from agents.objectives.fleet import FleetObjective
 from agents.objectives.objective import Objective
 from agents.objectives.suites import SuitesObjective
-from agents.objectives.topics import TopicsObjective
 
 OBJECTIVES: dict[str, type[Objective]] = {
     "environment": EnvironmentObjective,
     "queue": SuitesObjective,
     "families": FamiliesObjective,
-    "topics": TopicsObjective,
     "fleet": FleetObjective,
 }
 """``Settings.kind`` -> the objective."""

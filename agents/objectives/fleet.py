@@ -1,20 +1,19 @@
 """A fleet: one agent decides on every robot's buffer. Its objective is team QoI (mean H over robots) minus AFR's.
 
 The robots of a cell share its capacity, so bytes that one sends another cannot; each still sees its own buffer alone.
-The search begins at the rule ``gap-price`` and moves its numbers (``bufgym.policies.guided``).
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.objectives.objective import Evolved
+from agents.objectives.objective import Objective
+from agents.report import Report, Trained, report_rows
 from agents.settings import Settings
 from agents.tasks import Suites
 from bufgym import policies
@@ -24,13 +23,10 @@ from bufgym.envs import FleetVecEnv
 from bufgym.policies import Policy
 from bufgym.sb3 import GymVecEnv
 from bufgym.scenario import FleetEpisode, FleetScenario, suites
-from bufgym.scenario.numbered import by_trace, draw
+from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
 
-PARTS, EPISODES, EPISODE_S = 24, 1, 30.0
-"""Parts of the training episodes, one a generation in turn; episodes of each link and capacity in a part; their length,
-s. Each of fleet-v1's training links comes once."""
 VALIDATION_EPISODES = 4
 """Validation episodes per link, of the suite's own length."""
 
@@ -61,26 +57,9 @@ class FleetEpisodes:
         sender = self.fleet.senders.batch.senders
         return float((sender["delivered_gain"] + (sender["transmitted"] > 0)).mean())
 
-
-def mean_gain(policy: Policy, parts: Sequence[FleetEpisodes]) -> float:
-    """Team QoI above AFR's, mean over the parts."""
-    return float(np.mean([part.team_qoi(policy) - part.rival for part in parts]))
-
-
-def training_parts(chosen: Suites, seed: int) -> list[list[FleetEpisodes]]:
-    """``PARTS`` samples of the training episodes, each at every L; links in turn, ``EPISODES`` a sample."""
-    rng = np.random.default_rng(seed)
-    links = [link for _, link in by_trace(fleet_of(chosen, "train"))]
-    waiting: list[int] = []
-    parts = []
-    for _ in range(PARTS):
-        while len(waiting) < EPISODES:
-            waiting += rng.permutation(len(links)).tolist()
-        taken, waiting = [links[k] for k in waiting[:EPISODES]], waiting[EPISODES:]
-        short = [replace(link, uplink=replace(link.uplink, duration_s=EPISODE_S)) for link in taken]
-        episodes = [draw(link, int(rng.integers(10**6))) for link in short]
-        parts.append([FleetEpisodes(short[0], episodes, L) for L in chosen.capacities_of(chosen.suite[0])])
-    return parts
+    def measure(self, policy: Policy) -> float:
+        """AFR's team QoI less the policy's."""
+        return self.rival - self.team_qoi(policy)
 
 
 def validation_episodes(settings: Settings) -> list[FleetEpisodes]:
@@ -94,28 +73,21 @@ def validation_episodes(settings: Settings) -> list[FleetEpisodes]:
     return [FleetEpisodes(drawn[0][0], episodes, L) for L in capacities]
 
 
-class FleetObjective(Evolved):
+class FleetObjective(Objective):
     """The robots of one suite."""
 
-    name = "fleet"
     columns = ("gain",)
     best = max
     message = "team QoI {:+.4f} over AFR's on validation"
-    sigma = 0.05
-
-    @functools.cached_property
-    def training(self) -> list[list[FleetEpisodes]]:
-        """Episodes of ``training_parts``."""
-        return training_parts(self.settings.suites, self.seed)
 
     @functools.cached_property
     def judges(self) -> list[FleetEpisodes]:
         """Episodes of ``validation_episodes``."""
         return validation_episodes(self.settings)
 
-    def measure(self, policy: Policy, episodes: Sequence[FleetEpisodes]) -> float:
-        """Compute ``mean_gain``."""
-        return mean_gain(policy, episodes)
+    def validate(self, agent: Policy) -> tuple[float, ...]:
+        """Team QoI above AFR's on the validation episodes."""
+        return (-float(np.mean([part.measure(agent) for part in self.judges])),)
 
     def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
         """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others."""
@@ -132,6 +104,6 @@ class FleetObjective(Evolved):
         )
         return GymVecEnv(batch)
 
-    def rivals(self) -> list[Policy]:
-        """All fixed policies that may run on a fleet."""
-        return [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")]
+    def report(self, trained: Trained) -> Report:
+        """A row of the benchmark for each agent and fixed policy in each episode of the test split."""
+        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")])

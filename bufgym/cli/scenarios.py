@@ -153,7 +153,7 @@ class ScenarioOptions:
             return Described(scenarios.get("interruption", **law))
         refuse(law, "needs --interruption")
         if workload.workload is not None:
-            return _recording(workload.workload, stream, workload, seeds)
+            return recorded(workload.workload, stream, workload, seeds)
         refuse(given(workload, "topics", "odom", "bridge_gaps"), "needs --workload")
         if stream.motion is None:
             refuse(given(workload, *MOTION), "needs --motion, or --workload with --odom")
@@ -209,7 +209,7 @@ def _uplink(stream: StreamOptions, measured: MotionOptions) -> Described:
     return Described(scenarios.get("lte", **settings))
 
 
-def _recording(file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
+def recorded(file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
     """Make a workload as recorded; with --seeds it starts at random places of each trace."""
     from bufgym import scenario as scenarios
     from bufgym.model import qoi

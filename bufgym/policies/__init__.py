@@ -10,6 +10,7 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     checkpointing,
     classic,
     fragments,
+    gap_priority,
     gaps,
     middleware,
     price_dp,
@@ -36,7 +37,7 @@ def load(path: str | os.PathLike[str]) -> Policy:
     return weights.load(path)
 
 
-for _folder, _rules in (("", {}), ("/topics", {"for_topics": True}), ("/named", {"named_only": True})):
+for _folder, _rules in (("", {}), ("/named", {"named_only": True})):
     _shipped = files.shipped(f"agents{_folder}", f"agents/pretrained{_folder}", "*.safetensors")
     for _name, _path in _shipped.items():
         register_later(_name, functools.partial(load, _path), **_rules)

@@ -1,7 +1,7 @@
 """Learned policies among ordered candidates and what the rule ``gap-price`` would do: one network for every link.
 
 At every arrival the policy looks at the k cheapest candidates and the head, as ``candidate_network`` does, at what the
-rule knows (``guided.INPUTS``), and at the rule's own decision. Its network has an output for each action:
+rule knows (``rule_inputs.INPUTS``), and at the rule's own decision. Its network has an output for each action:
 
     0: accept where there is room, else drop the cheapest;  1 to k + 1: candidates;  k + 2: what the rule does
 
@@ -29,7 +29,8 @@ from bufgym.model.observe import (
 )
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
-from bufgym.policies.guided import (
+from bufgym.policies.registry import Arrival, Memory, Policy
+from bufgym.policies.rule_inputs import (
     BASE,
     INPUT_FIELDS,
     LOG_RATE_VARIANCE,
@@ -40,7 +41,6 @@ from bufgym.policies.guided import (
     inputs,
     recall,
 )
-from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.target_gap import SEEN_US
 from bufgym.policies.thinning import steady
 

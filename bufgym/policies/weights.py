@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as serialized
 
 from bufgym.policies.candidate_network import CandidateWeights
-from bufgym.policies.guided import GuidedWeights
-from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
 from bufgym.policies.ruled_network import RuledWeights
@@ -27,13 +25,18 @@ from bufgym.utils.files import read_whole, replaced
 
 StrPath = str | os.PathLike[str]
 Tensors = dict[str, NDArray[np.float32]]
-AnyWeights = Weights | GuidedWeights | CandidateWeights
-Kind = type[Weights] | type[GuidedWeights] | type[CandidateWeights]
+AnyWeights = Weights | CandidateWeights
+Kind = type[Weights] | type[CandidateWeights]
 
 FORMAT = 1
 MAX_BYTES = 1 << 20  # Largest file accepted, bytes: a slot scorer has a few kilobytes
 MAX_WIDTH = 256  # Most units of a hidden layer
 KEY = "bufgym"  # The entry of the header's metadata that holds the JSON text
+GONE = {
+    "scheduler": "gap-priority is that rule now, and python train.py tune gap-priority finds its numbers",
+    "guided": "gap-price is that rule now, and python train.py tune gap-price finds its numbers",
+}
+"""A network that files had -> what takes its place."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")  # Metadata that ``save`` itself writes
 
 
@@ -118,7 +121,10 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     except safetensors.SafetensorError as error:
         raise BufgymError(f"{path}: no safetensors file, or a broken one: {error}") from None
     prefixes = {name.partition(".")[0] for name in entries}
-    kinds: tuple[Kind, ...] = (GuidedWeights, SchedulerWeights, CandidateWeights, RuledWeights)
+    for network, now in GONE.items():
+        if network in prefixes:
+            raise BufgymError(f"{path}: numbers that moved a rule's, as bufgym made them until 0.2: {now}")
+    kinds: tuple[Kind, ...] = (CandidateWeights, RuledWeights)
     kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
     fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}

@@ -19,7 +19,7 @@ for topic in client.topics:
 # %%
 import bufgym
 
-names = ["learned-scheduler", "robofleet", "strict-priority", "fifo", "ros-native"]
+names = ["gap-priority", "robofleet", "strict-priority", "fifo", "ros-native"]
 rows = bufgym.compare(names, client, capacity=32, seeds=2).rows
 for name in names:  # a row for each topic of a run; the run's weighted sum is in all of them
     h = [row["weighted_qoi"] for row in rows if row["policy"] == name and row["topic"] == client.topics[0].name]

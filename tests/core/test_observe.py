@@ -18,7 +18,7 @@ from bufgym.model.link import Link
 from bufgym.model.observe import FIELDS, TOPIC_FIELDS, Field, declare
 from bufgym.model.qoi import saturating
 from bufgym.model.topics import Topic
-from bufgym.policies import guided, guided_topics
+from bufgym.policies import chains, rule_inputs
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders
 from bufgym.sim.decisions import decide
@@ -206,12 +206,7 @@ def test_no_loss_is_rounded_below_nothing():
 
 ON_BOARD = (*observe.ON_BOARD_FIELDS, *observe.ON_BOARD_SLOT_FIELDS)
 OBSERVED = (*observe.FIELDS, *observe.TOPIC_FIELDS, *ON_BOARD)
-TABLES = {
-    "observed": OBSERVED,
-    "guided": guided.INPUT_FIELDS,
-    "guided topics": guided_topics.INPUT_FIELDS,
-    "scorers": (*observe.FIELDS, *ON_BOARD),
-}
+TABLES = {"observed": OBSERVED, "of the rule": rule_inputs.INPUT_FIELDS, "scorers": (*observe.FIELDS, *ON_BOARD)}
 GROUPS = {"queue", "time", "motion", "value", "link", "topic"}
 
 
@@ -250,27 +245,25 @@ def test_fields_of_one_queue_stay_in_their_bounds(case, v) -> None:
         observe.observe_on_board(buffer, arrival, context)
         observe.observe_on_board_slots(buffer, arrival, rows)
         check(ON_BOARD, [*context, *rows])
-        context = np.zeros(guided.N_INPUTS)
-        guided.recall(buffer, arrival, memory, guided.BASE)
-        guided.inputs(buffer, arrival, memory, guided.BASE, context)
-        check(guided.INPUT_FIELDS, context)
+        context = np.zeros(rule_inputs.N_INPUTS)
+        rule_inputs.recall(buffer, arrival, memory, rule_inputs.BASE)
+        rule_inputs.inputs(buffer, arrival, memory, rule_inputs.BASE, context)
+        check(rule_inputs.INPUT_FIELDS, context)
         return ANYTHING.on_arrival(buffer, arrival, memory)
 
-    watched = policies.Policy("watched", on_arrival, memory=guided.REMEMBERED, work=guided.WORK, reads_rate=True)
+    watched = policies.Policy(
+        "watched", on_arrival, memory=rule_inputs.REMEMBERED, work=chains.SCRATCH, reads_rate=True
+    )
     case.run(watched, v)
 
 
 @pytest.mark.kernels
 @given(topic_cases(min_topics=2, max_messages=25))
 def test_fields_of_several_topics_stay_in_their_bounds(case: TopicCase) -> None:
-    seen = np.zeros(len(guided_topics.INPUT_FIELDS))
-
     def on_arrival(buffer, arrival, memory):
         numbers = observed(buffer, arrival, True)
         fields = observe.FIELDS + observe.TOPIC_FIELDS
         check(fields, [numbers[field.name] for field in fields])
-        guided_topics.write_inputs(buffer, seen)
-        check(guided_topics.INPUT_FIELDS, seen)
         return ANYTHING.on_arrival(buffer, arrival, memory)
 
     case.run(policies.Policy("watched", on_arrival, client=case.client, reads_rate=True, for_topics=True))

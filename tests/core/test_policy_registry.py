@@ -68,7 +68,12 @@ def test_agrees_with_reference(spec, case, v):
     assert (sender["retained_gain"] + 1 if kept else 0) == pytest.approx(naive.information(v, kept), abs=1e-9)
 
 
-ELSEWHERE = {"target-gap": "test_target_gap.py", "price-dp": "test_price_dp.py", "gap-price": "test_guided.py"}
+ELSEWHERE = {
+    "target-gap": "test_target_gap.py",
+    "price-dp": "test_price_dp.py",
+    "gap-price": "test_price_dp.py",
+    "gap-priority": "test_gap_priority.py",
+}
 """Policy -> the file beside this one that has its reference model. That of networks is in test_learned.py."""
 
 

@@ -15,7 +15,7 @@ from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
-from bufgym.policies import guided, target_gap, thinning, weights
+from bufgym.policies import chains, price_dp, rule_inputs, target_gap, thinning, weights
 from bufgym.policies.registry import Policy
 from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watched, watcher
 from bufgym.scenario import Episode, messages
@@ -38,14 +38,17 @@ def reference(made, margins):
     """A policy that decides by these weights; by how much the best decision leads goes to ``margins``."""
 
     def on_arrival(buffer, arrival, memory):
-        guided.recall(buffer, arrival, memory, guided.BASE)
-        known = np.zeros(guided.N_INPUTS)
-        guided.inputs(buffer, arrival, memory, guided.BASE, known)
-        by_rule = guided.follow(buffer, arrival, memory, guided.BASE, np.zeros(guided.N_OUTPUTS))
+        rule_inputs.recall(buffer, arrival, memory, rule_inputs.BASE)
+        known = np.zeros(rule_inputs.N_INPUTS)
+        rule_inputs.inputs(buffer, arrival, memory, rule_inputs.BASE, known)
+        rule = memory[rule_inputs.RULE :]
+        a = price_dp.share(rule, rule_inputs.BASE)
+        priced = (price_dp.decide, (a,)) if a > 0 else (target_gap.decide, ())
+        by_rule = priced[0](buffer, arrival, rule, rule_inputs.BASE, *priced[1])
         candidates, x = found(buffer, arrival, made.candidates)
         does, room = decisions_of(buffer, arrival, [j for j, _ in candidates])
-        is_old = memory[guided.RULE + target_gap.SEEN_US] > 3e6
-        if is_old and thinning.steady(buffer) and math.sqrt(memory[guided.LOG_RATE_VARIANCE]) < 0.005:
+        is_old = memory[rule_inputs.RULE + target_gap.SEEN_US] > 3e6
+        if is_old and thinning.steady(buffer) and math.sqrt(memory[rule_inputs.LOG_RATE_VARIANCE]) < 0.005:
             does = [None for _ in does]
         same_as_rule = [float(decision == by_rule) for decision in does]
         state = [float(room), math.log(buffer.capacity / 8)]
@@ -57,7 +60,7 @@ def reference(made, margins):
         margins.append(best - max((value for value, other in offered if other != decision), default=-math.inf))
         return decision
 
-    return Policy("reference", on_arrival, memory=guided.REMEMBERED, work=guided.WORK, reads_rate=True)
+    return Policy("reference", on_arrival, memory=rule_inputs.REMEMBERED, work=chains.SCRATCH, reads_rate=True)
 
 
 @st.composite

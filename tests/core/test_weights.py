@@ -12,7 +12,7 @@ import pytest
 from cases import same
 from refusal_cases import refuse
 from safetensors.numpy import save as safetensors
-from weight_cases import ABOUT, CHOICES, KINDS, QUEUE, TOPICS, made, parts_of, put, put_changed, random_weights, refused
+from weight_cases import ABOUT, CHOICES, KINDS, QUEUE, made, parts_of, put, put_changed, random_weights, refused
 
 from bufgym import __version__, policies
 from bufgym.model import qoi
@@ -77,15 +77,11 @@ def test_reading_a_policy_needs_no_torch(path):
     assert done.stdout.split() == ["False"]
 
 
-def test_a_scheduler_is_no_policy_for_one_queue(path):
-    weights.save(path, made(kind=TOPICS), ABOUT)
-    policy = policies.load(path)
-    assert policy.schedules and policy.for_topics and policy.ranked
-    before = made(kind=TOPICS)
-    assert weights.read(path)[0].weight.tobytes() == before.weight.tobytes()
-    # Nor is it one whose network has another name.
-    put(path, {"guided.weight": before.weight}, parts_of(path)[1])
-    refused(path, "trained on other observations")
+@pytest.mark.parametrize(("network", "rule"), [("scheduler", "gap-priority"), ("guided", "gap-price")])
+def test_a_file_of_numbers_that_moved_a_rule_names_what_does_so_now(path, network, rule):
+    weights.save(path, made(3), ABOUT)
+    put(path, {f"{network}.weight": np.zeros((17, 9), np.float32)}, parts_of(path)[1])
+    refused(path, f"{rule} is that rule now, and python train.py tune {rule} finds its numbers")
 
 
 def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
@@ -129,7 +125,7 @@ def test_metadata_that_could_not_be_read_are_not_written(path, about, rule):
 
 
 def test_weights_that_could_not_be_read_are_not_written(path):
-    good, nan = made(3), np.full(TOPICS.SHAPE, np.nan, np.float32)
+    good = made(3)
     for bad, rule in (
         (replace(good, drop=replace(good.drop, bias=np.float32([np.nan]))), r"tensor drop\.bias must hold"),
         (replace(good, accept=made(4).accept), r"accept\.0\.weight = .*must be \[2, 3\]"),
@@ -138,7 +134,6 @@ def test_weights_that_could_not_be_read_are_not_written(path):
         (made(3, 3, 3, 3, kind=CHOICES), "3 at most"),
         (replace(made(3, kind=CHOICES), candidates=5), r"must be \[45, 3\] for 5 candidates"),
         (replace(made(3, kind=CHOICES), activation="elu"), "activation = elu: must be one of relu, tanh"),
-        (TOPICS(nan), r"tensor scheduler\.weight must hold"),
         (made(3, fields=("speed", "service_ratio")), "field = speed: unknown"),
     ):
         refuse(rule, weights.save, path, bad, ABOUT)
@@ -233,14 +228,10 @@ def test_metadata_that_are_no_json_object_are_refused(path, text, rule):
         (QUEUE, "about", ["no", "text"], "must be one line of text"),
         (QUEUE, "bufgym", None, "must be text"),
         (QUEUE, "observation", "0" * 64, "trained on other observations than this bufgym's: train it again"),
-        (TOPICS, "observation", weights.observation_hash(QUEUE), "trained on other observations than this bufgym's"),
         (QUEUE, "fields", "time_merged", "must be a list of at least one field"),
-        (TOPICS, "fields", [], "must be a list of at least one field"),
         (QUEUE, "fields", ["time_merged", ["service_ratio"]], "unknown; known: occupied, rank"),
         (QUEUE, "fields", ["service_ratio", "service_ratio"], "field = service_ratio: given more than once"),
         (QUEUE, "fields", ["service_ratio"], "must be [1] for 1 fields and hidden layers of [3]"),
-        (TOPICS, "fields", ["one", "speed"], "field = speed: unknown; known: one, fill"),
-        (TOPICS, "fields", ["fill", "one"], "the file was changed"),
         (CHOICES, "fields", ["candidate_place"], "fields = ['candidate_place']: must be candidate_place, candidate_n"),
         (CHOICES, "candidates", 65, "candidates = 65: must be a whole number from 1 to 64"),
         (CHOICES, "candidates", True, "candidates = True: must be a whole number"),
@@ -292,8 +283,6 @@ def numbers(*shape, kind=np.float32):
         (QUEUE, "drop.out", numbers(3, kind=np.float64), "type of tensor drop.out = F64: must be F32"),
         (QUEUE, "drop.out", np.float32([0, np.nan, 0]), "tensor drop.out must hold finite numbers alone"),
         (QUEUE, "still.drop.out", numbers(3), "tensor still.drop.out has no place"),
-        (TOPICS, "scheduler.weight", numbers(3, 5), "tensor scheduler.weight = '[3, 5]': must be [17, 9]"),
-        (TOPICS, "drop.mix", numbers(1, 2), "tensor drop.mix has no place"),
         (CHOICES, "candidates.out.weight", None, "tensor candidates.out.weight is missing"),
         (CHOICES, "candidates.0.bias", None, "tensor candidates.0.bias is missing"),
         (CHOICES, "candidates.0.bias", numbers(257), "1 to 256 hidden units"),

@@ -12,7 +12,6 @@ from safetensors.numpy import save as safetensors
 from bufgym import policies
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights, inputs
-from bufgym.policies.guided_topics import SchedulerWeights
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.utils.errors import BufgymError
@@ -65,15 +64,13 @@ def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0):
     return RuledWeights(k, True, True, activation, random_layers([seen(k), *widths, k + 3], seed, accept))
 
 
-KINDS = QUEUE, TOPICS, CHOICES = Weights, SchedulerWeights, CandidateWeights
+KINDS = QUEUE, CHOICES = Weights, CandidateWeights
 FIELDS = ("time_merged", "service_ratio")
 ABOUT = {"name": "small", "about": "Drops what is in its way.", "seeds": [0, 1], "scores": {"regret": 0.25}}
 
 
 def made(*widths, kind=QUEUE, fields=FIELDS, seed=0):
     """Weights of any kind; the network among candidates is asked at arrivals, and has no masks."""
-    if kind is TOPICS:
-        return TOPICS(np.random.default_rng(seed).normal(size=TOPICS.SHAPE).astype(np.float32))
     if kind is CHOICES:
         return random_choices(2, True, *widths, seed=seed)
     return random_weights(fields, *widths, seed=seed)

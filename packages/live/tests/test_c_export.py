@@ -16,7 +16,6 @@ from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy
-from bufgym.policies.guided import GuidedWeights
 from bufgym.policies.learned import NAMES
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
@@ -92,14 +91,8 @@ def every_field() -> Policy:
     return random_weights(NAMES, 7, 5, seed=3).policy("every-field")
 
 
-def every_output() -> Policy:
-    """A random agent that changes every number of the rule it guides."""
-    weight = 0.4 * np.random.default_rng(4).normal(size=GuidedWeights.SHAPE)
-    return GuidedWeights(weight).policy("every-output")
-
-
 AGENTS = {"learned": policies.get("learned")}
-AGENTS |= {"every-field": every_field(), "every-output": every_output()}
+AGENTS |= {"every-field": every_field()}
 AGENTS |= {
     "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
     "at-arrivals": random_choices(3, True, 6, 5, 4, activation="relu", seed=13, accept=4.0).policy("at-arrivals"),
@@ -202,7 +195,7 @@ def test_the_command_writes_the_header(tmp_path, capsys):
             "rosbridge --to c --out {}",
             "policy rosbridge: has no C: its queue is unbounded; known: afr, afr-paper, codel, ",
         ),
-        ("learned-scheduler {} --to c", "is made for several topics, and the queue in C has one"),
+        ("gap-priority {} --to c", "is made for several topics, and the queue in C has one"),
         ("afr --to c", "export needs --out"),
         ("afr {} --to c --name mine", "--name belongs to --to safetensors"),
         ("model.zip {} --capacity 4 --name a", "--capacity belongs to --to c"),

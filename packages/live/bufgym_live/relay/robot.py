@@ -37,7 +37,7 @@ from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
-POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "learned-scheduler")
+POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "gap-priority")
 """Policies that a viewer may choose by default."""
 _RATES_HZ: Final = {"status": 1 / STATUS_S, "queue": 1 / QUEUE_S}
 _OWN: Final = tuple(Stream(Topic(name, priority=20.0, weight=0.0), hz, 1000) for name, hz in _RATES_HZ.items())

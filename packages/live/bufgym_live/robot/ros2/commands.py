@@ -44,7 +44,7 @@ async def send(
     Args:
         config: Topics with rates and priorities, as in examples/client.toml.
         to: HOST:PORT of the receiver.
-        policies: The policy, as in bench (default: afr; for several topics learned-scheduler).
+        policies: The policy, as in bench (default: afr; for several topics gap-priority).
         capacity: L, messages.
         odom: Topic with poses, which give x to the topics that move.
         log: Log every decision to this file (.mcap), for live replay.
@@ -82,7 +82,7 @@ async def send(
 
 _ABOUT = {
     "topics": "Names, or patterns with * and ?, besides the topics in --config",
-    "policy": "Drops messages when the queue is full; empty: afr for one topic, learned-scheduler for several",
+    "policy": "Drops messages when the queue is full; empty: afr for one topic, gap-priority for several",
     "value": "V of topics without one, as exponential:0.618 or saturating:4",
     "capacity": "L, messages of all topics together",
     "odometry": "Topic with poses, which gives x to the topics that move",

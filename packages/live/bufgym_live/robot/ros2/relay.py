@@ -137,7 +137,7 @@ class RosSender:
             client: topics with their rules; ``bufgym.scenario.read_client`` reads one.
             topics: more topics, without rules; their x is the motion with ``odometry``, otherwise it counts messages.
                 A name with ``*`` or ``?``, here or in ``client``, is a pattern, and stands for up to 64 topics.
-            policy: a drop rule for one topic, a scheduler for several; None: afr or learned-scheduler.
+            policy: a drop rule for one topic, a scheduler for several; None: afr or gap-priority.
             capacity: L, messages of all topics together, and the least depth of each subscription.
             value: V of topics without one; None: the client's, or 1 - 0.618^d.
             odometry: a topic with poses, which gives x to topics that move; x of other topics is time. The poses of one
@@ -157,7 +157,7 @@ class RosSender:
                 log(one)
 
         self.queue = PolicyQueue(
-            policy or ("afr" if len(rules) == 1 else "learned-scheduler"),
+            policy or ("afr" if len(rules) == 1 else "gap-priority"),
             capacity,
             value=value,
             topics=rules,

@@ -1,33 +1,23 @@
-"""Evolved agents repeat on a cluster; interruptions of every length at once; the page of the shipped agent."""
+"""Families of links: interruptions of every length at once; the page of the shipped agent."""
 
-import csv
-import importlib.util
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from cli_cases import Patch
-from needs import needs
 from refusal_cases import refuse
-from safetensors.numpy import load_file
+from weight_cases import random_weights
 
-from agents import cluster
 from agents.families import Family, run_of
 from agents.mixed_env import Cell
-from agents.runs import MODEL
-from agents.settings import Cluster
 from bufgym import policies
 from bufgym.oracle import EveryLength, integer, law
-from bufgym.policies import guided, weights
+from bufgym.policies import weights
 from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.traces import Trace
-from bufgym.utils.errors import BufgymError
 from studies import families, learned
 
 SHORT = Cell("short", Interruption(t_max=40), 5)
@@ -43,59 +33,6 @@ def test_one_run_through_the_longest_interruption_is_a_run_through_each(name: st
     best = [1 + integer(5, T, scenario.value) for T in range(1, 41)]
     share = law(scenario)[1:]
     assert lengths.regrets(policy)[0] == pytest.approx(1 - share @ qoi / (share @ best), abs=1e-12)
-
-
-REPO = Path(__file__).resolve().parent.parent
-LIBRARY = {"dask": "distributed", "ray": "ray"}
-FEW = {"suite": "fleet-v1", "capacities": "4", "validate_every": 230_000}
-FEW |= {"validation_episodes": 2, "test_seeds": 1, "seeds": 2}
-
-
-def trained(name: str, steps: int, *more: str) -> None:
-    """A command of its own, as cluster libraries begin processes and threads that outlive a test."""
-    options = [(f"--{key.replace('_', '-')}", str(value)) for key, value in FEW.items()]
-    words = [word for pair in options for word in pair]
-    command = [sys.executable, str(REPO / "train.py"), "evolve", *words, "--name", name, "--steps", str(steps), *more]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def fitness(folder: Path, seed: int) -> list[tuple[str, str]]:
-    with (folder / f"seed-{seed}" / "curve.csv").open(newline="", encoding="utf-8") as file:
-        return [(row["steps"], row["fitness"]) for row in csv.DictReader(file)]
-
-
-@pytest.fixture(scope="module")
-def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(tmp_path_factory.mktemp("local"))
-        trained("local", 460_000)
-        return Path("runs/local").resolve()
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("backend", ["dask", "ray"])
-@pytest.mark.timeout(900)  # three trainings, two of them on a cluster that begins
-def test_a_cluster_gives_the_same_agents_bit_for_bit(backend: str, request: pytest.FixtureRequest) -> None:
-    """Two seeds; on the cluster half of the steps, and then the rest."""
-    if importlib.util.find_spec(LIBRARY[backend]) is None:
-        pytest.skip(needs("ray" if backend == "ray" else "extras", LIBRARY[backend]))
-    local: Path = request.getfixturevalue("local")  # only where there is something to compare
-    trained("cluster", 230_000, "--backend", backend)
-    trained("cluster", 460_000, "--backend", backend, "--resume")
-    cluster = Path("runs/cluster")
-    for seed in (0, 1):
-        assert fitness(cluster, seed) == fitness(local, seed) and len(fitness(local, seed)) > 1
-        one, other = (load_file(folder / f"seed-{seed}" / MODEL) for folder in (local, cluster))
-        assert one.keys() == other.keys()
-        assert all(one[key].tobytes() == other[key].tobytes() for key in one)
-
-
-@pytest.mark.parametrize("backend", ["dask", "ray"])
-def test_a_missing_library_is_one_clear_error(backend: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, LIBRARY[backend], None)
-    with pytest.raises(BufgymError, match=f"needs {LIBRARY[backend]}: "), cluster.running(Cluster(backend)):
-        pass
 
 
 # The page of the agent for all links: its families, shares and intervals.
@@ -126,14 +63,15 @@ def test_shares_are_sums_over_the_links_drawn() -> None:
 
 
 def test_the_page_compares_files_with_rules_and_an_older_agent(tmp_path: Path, monkeypatch: Patch) -> None:
-    """By hand: the network of the files does what gap-price does, the older agent is another rule's numbers."""
+    """By hand: the network of the files does what gap-price does, the older agent drops the cheapest."""
     few = runs()
     found = {"task": few, "default-frames": few}
     monkeypatch.setattr(learned, "families", lambda split, folder, data=None, leave_out=(): found)
     first = np.zeros((seen(3), 4), np.float32), np.zeros(4, np.float32)
     last = np.zeros((4, 6), np.float32), np.array([0, 0, 0, 0, 0, 1], np.float32)  # the sixth action is the rule's
     mine = RuledWeights(3, True, True, "tanh", (first, last))
-    old = guided.GuidedWeights(np.full(guided.GuidedWeights.SHAPE, 0.1, np.float32))
+    reject = np.zeros((4, 6), np.float32), np.array([0, 1, 0, 0, 0, 0], np.float32)  # the cheapest goes, room or not
+    old = RuledWeights(3, True, True, "tanh", (first, reject))
     made, before = tmp_path / "mine.safetensors", tmp_path / "old.safetensors"
     weights.save(made, mine, {"name": "learned", "training": "python train.py hindsight --families all", "seeds": [3]})
     weights.save(before, old, {"name": "old"})
@@ -151,8 +89,7 @@ def test_the_page_compares_files_with_rules_and_an_older_agent(tmp_path: Path, m
 
 
 def test_who_names_no_network_is_told(tmp_path: Path) -> None:
-    old = guided.GuidedWeights(np.zeros(guided.GuidedWeights.SHAPE, np.float32))
-    file = weights.save(tmp_path / "old.safetensors", old, {"name": "old"})
+    file = weights.save(tmp_path / "old.safetensors", random_weights(["rank"]), {"name": "old"})
     refuse("old.safetensors: is no network among candidates", learned.main, file)
     refuse("name at least one file", learned.main)
 
