@@ -1,8 +1,10 @@
 """Relay that subscribes on the robot, sends over one uplink, and republishes at the other end.
 
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
+                     latched topics            -> Latched ----->
 
-Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Commands go the other
+Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor, but those of latched
+topics, whose messages are taken with their publishers (``taking``). Commands go the other
 way through a second pair with ``no_drop`` topics.
 """
 
@@ -20,13 +22,15 @@ from bufgym.scenario import Client
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
+from bufgym_live.robot.latched import Latched
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
 from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
-from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, resolved
+from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, publishers, resolved
 from bufgym_live.robot.ros2.places import left_out, places
 from bufgym_live.robot.ros2.republishing import HOLD_S, Republisher
+from bufgym_live.robot.ros2.taking import source_of, take_all, untaken
 from bufgym_live.robot.sender import Leaves, Sender
 from bufgym_live.robot.sockets import BACKOFF_S, host_port
 from bufgym_live.robot.tasks import until_one_ends
@@ -35,6 +39,7 @@ SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2  # Time between two searches for publishers
 TELL_S: Final = 1.0  # Time between two messages on /diagnostics
+LATCHED_DEPTH: Final = 1000  # Messages of a latched topic that wait to be taken: more than it has publishers
 
 
 @contextmanager
@@ -164,12 +169,13 @@ class RosSender:
             window=window or 1,
             log=record,
         )
+        self.latched = Latched()
+        self._taken: dict[str, tuple[Published, int, Any]] = {}  # latched topics, their numbers and subscriptions
         leaves: Leaves = "sent" if window is None else "acked"
         self._fault = "no answer yet"
         self._to = host_port(host, port)
-        self.sender = Sender(
-            self.queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff_s), leaves, self._on_connection
-        )
+        connect = partial(TRANSPORTS[transport], host, port, backoff_s=backoff_s)
+        self.sender = Sender(self.queue, connect, leaves, self._on_connection, self.latched)
         self._depth = capacity
         self._left_out: set[str] = set()
         self._odometry_topic: str | None
@@ -184,7 +190,7 @@ class RosSender:
                 place.resolve(node)
             async with spinning(node):
                 looking = look(node, partial(self._names, node), partial(self._subscribe, node), RECEIVER, self._say)
-                await until_one_ends(self.sender.run(), looking, self._tell(node))
+                await until_one_ends(self.sender.run(), looking, self._take_latched(node), self._tell(node))
 
     def _on_connection(self, fault: str) -> None:
         self._fault = fault
@@ -212,9 +218,22 @@ class RosSender:
         names = [place.name for place in self._places if place.name is not None]
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
+    async def _take_latched(self, node: Any) -> None:
+        """Take latched topics' messages from time to time; they are no stream."""
+        while True:
+            for topic, number, subscription in self._taken.values():
+                for message, source, stamp_ns in take_all(subscription):
+                    known = self.latched.sources(number)
+                    if source not in known and len(known) >= topic.depth:
+                        self.latched.keep(number, {source_of(gid) for gid in publishers(node, topic.name, RECEIVER)})
+                    self.latched.put(number, source, topic.head() + message, stamp_ns // 1000)
+            await asyncio.sleep(LOOK_S)
+
     def _subscribe(self, node: Any, topic: Published) -> list[Any]:
         made = []
-        self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
+        self._taken.pop(topic.name, None)
+        what = ", latched" if topic.latched else ""
+        self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}{what}")
         number = next((k for k, place in enumerate(self._places) if place.name == topic.name), None)
         if number is not None:
             place, head = self._places[number], topic.head()
@@ -223,9 +242,14 @@ class RosSender:
                 moved = None if self._odometry_topic is None else self._odometry.x
                 self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
-            deep = replace(topic, depth=max(self._depth, topic.depth)).qos
+            deep = replace(topic, depth=max(LATCHED_DEPTH if topic.latched else self._depth, topic.depth)).qos
             kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
-            made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
+            group = untaken() if topic.latched else None
+            made.append(
+                node.create_subscription(kind, topic.name, put, deep, raw=True, callback_group=group, **options)
+            )
+            if topic.latched:
+                self._taken[topic.name] = topic, number, made[0]
         if topic.name == self._odometry_topic:
             made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
