@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 from itertools import count
 
-from ros2_session import BASE, LATCHED, ROBOT, Side, processes, start
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros2_session import BASE, LATCHED, ROBOT, Side, processes, start
 from std_msgs.msg import String
 
 from bufgym_live.robot.sockets import free_port
@@ -64,7 +64,7 @@ def main(dead_s: float) -> None:
         spin(f"a late viewer's {era}", lambda: whole(viewers[-1], era))
         until_s = time.monotonic() + 0.5
         spin("half a second", lambda: time.monotonic() > until_s)
-        return viewers[-1].came
+        return {name: list(texts) for name, texts in viewers[-1].came.items()}
 
     def restart(how: int) -> None:
         processes[-1 if len(processes) > 2 else 0].send_signal(how)

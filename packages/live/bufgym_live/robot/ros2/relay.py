@@ -22,6 +22,7 @@ from bufgym.scenario import Client
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
+from bufgym_live.robot.frames import MAX_BODY_BYTES
 from bufgym_live.robot.latched import Latched
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
@@ -178,6 +179,7 @@ class RosSender:
         self.sender = Sender(self.queue, connect, leaves, self._on_connection, self.latched)
         self._depth = capacity
         self._left_out: set[str] = set()
+        self._too_large: set[str] = set()
         self._odometry_topic: str | None
         self._odometry_topic, self._odometry = (None, Odometry()) if odometry is None else followed(odometry)
         self._say = say
@@ -218,6 +220,14 @@ class RosSender:
         names = [place.name for place in self._places if place.name is not None]
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
+    def _fits(self, topic: Published, size_bytes: int) -> bool:
+        """Whether a receiver takes a message of this size; says so once for each topic if not."""
+        most_bytes = MAX_BODY_BYTES - len(topic.head())
+        if size_bytes > most_bytes and topic.name not in self._too_large:
+            self._too_large.add(topic.name)
+            self._say(f"{topic.name}: dropped: messages over {most_bytes} bytes, as one of {size_bytes}")
+        return size_bytes <= most_bytes
+
     async def _take_latched(self, node: Any) -> None:
         """Take latched topics' messages from time to time; they are no stream."""
         while True:
@@ -226,7 +236,8 @@ class RosSender:
                     known = self.latched.sources(number)
                     if source not in known and len(known) >= topic.depth:
                         self.latched.keep(number, {source_of(gid) for gid in publishers(node, topic.name, RECEIVER)})
-                    self.latched.put(number, source, topic.head() + message, stamp_ns // 1000)
+                    if self._fits(topic, len(message)):
+                        self.latched.put(number, source, topic.head() + message, stamp_ns // 1000)
             await asyncio.sleep(LOOK_S)
 
     def _subscribe(self, node: Any, topic: Published) -> list[Any]:
@@ -240,7 +251,8 @@ class RosSender:
 
             def put(message: bytes) -> None:
                 moved = None if self._odometry_topic is None else self._odometry.x
-                self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
+                if self._fits(topic, len(message)):
+                    self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
             deep = replace(topic, depth=max(LATCHED_DEPTH if topic.latched else self._depth, topic.depth)).qos
             kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
