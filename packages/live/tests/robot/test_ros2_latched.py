@@ -77,6 +77,7 @@ def test_a_message_over_the_limit_is_dropped_with_one_line_of_its_topic(monkeypa
     monkeypatch.setattr(Published, "serialized_class", None)
     monkeypatch.setattr(Published, "qos", None)
     monkeypatch.setattr(relay, "overriding", lambda: None)
+    monkeypatch.setattr(relay, "of_subscription", lambda name, say: None)
     robot = RosSender(None, "127.0.0.1", 1, topics=["/image", "/scan"], policy="fifo", say=said.append)
     for place in robot._places:
         place.name = place.wanted

@@ -28,6 +28,7 @@ from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
 from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
+from bufgym_live.robot.ros2.mismatch import of_subscription
 from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, publishers, resolved
 from bufgym_live.robot.ros2.places import left_out, places
 from bufgym_live.robot.ros2.republishing import HOLD_S, Republisher
@@ -255,11 +256,13 @@ class RosSender:
                     self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
             deep = replace(topic, depth=max(LATCHED_DEPTH if topic.latched else self._depth, topic.depth)).qos
-            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
-            group = untaken() if topic.latched else None
-            made.append(
-                node.create_subscription(kind, topic.name, put, deep, raw=True, callback_group=group, **options)
-            )
+            options = {
+                "qos_overriding_options": overriding(),
+                "event_callbacks": of_subscription(topic.name, self._say),
+            }
+            options["callback_group"] = untaken() if topic.latched else None
+            kind = topic.serialized_class
+            made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
             if topic.latched:
                 self._taken[topic.name] = topic, number, made[0]
         if topic.name == self._odometry_topic:
@@ -285,7 +288,8 @@ async def receive(
         receiver = Receiver(republisher)
         say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
-            await asyncio.Event().wait()
+            async with spinning(node):
+                await asyncio.Event().wait()
         finally:
             await receiver.close()
             republisher.drain()

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.receiver import Received
+from bufgym_live.robot.ros2.mismatch import of_publisher
 from bufgym_live.robot.ros2.names import Published, overriding, parse
 from bufgym_live.robot.ros2.states import States
 
@@ -47,7 +48,7 @@ class Republisher:
         # Publishing comes last: a connection that ends while this waits leaves the message to the next one.
         if topic not in self._matched:
             name = publisher.topic_name
-            known = functools.partial(self._node.count_subscribers, name)
+            known = functools.partial(_readers, self._node, name, topic.qos)
             await readers_found(name, publisher.get_subscription_count, known, self._hold_until_s, self._say)
             self._matched.add(topic)
         publisher.publish(body)
@@ -61,13 +62,22 @@ class Republisher:
 
     def _made(self, topic: Published) -> Any:
         try:
-            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+            options = {"qos_overriding_options": overriding(), "event_callbacks": of_publisher(topic.name, self._say)}
+            kind = topic.serialized_class
             publisher = self._node.create_publisher(kind, topic.name, topic.qos, **options)
         except BufgymError as error:
             self._say(f"{topic.name}: dropped: {error}")
             return None
         self._say(f"{topic.name}: {topic.type}" + (f", latched by {topic.depth}" if topic.latched else ""))
         return publisher
+
+
+def _readers(node: Any, name: str, qos: Any) -> int:
+    """Count the readers that can match a publisher of this quality of service; others would be waited for in vain."""
+    from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+    asked = [one.qos_profile for one in node.get_subscriptions_info_by_topic(name)]
+    return sum(qos_check_compatible(qos, one)[0] != QoSCompatibility.ERROR for one in asked)
 
 
 async def readers_found(

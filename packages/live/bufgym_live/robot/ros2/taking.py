@@ -89,15 +89,16 @@ def _library(name: str) -> Any:
 
 @cache
 def untaken() -> Any:
-    """A callback group whose subscriptions rclpy's executor never takes from."""
+    """A callback group whose subscriptions rclpy's executor never takes from; it calls their events."""
     from rclpy.callback_groups import CallbackGroup
+    from rclpy.subscription import Subscription
 
     class Untaken(CallbackGroup):  # type: ignore[misc]
         def can_execute(self, entity: Any) -> bool:
-            return False
+            return not isinstance(entity, Subscription)
 
         def beginning_execution(self, entity: Any) -> bool:
-            return False
+            return not isinstance(entity, Subscription)
 
         def ending_execution(self, entity: Any) -> None:
             pass
