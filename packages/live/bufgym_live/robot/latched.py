@@ -29,21 +29,28 @@ class Latched:
 
     def __init__(self) -> None:
         self._states: dict[tuple[int, int], State] = {}  # in the order of their numbers
-        self._number = 0
+        self.number = 0
+        """Number of the state that is put next."""
         self._lock = threading.Lock()
         self._waiting: tuple[asyncio.AbstractEventLoop, asyncio.Event] | None = None
 
     def put(self, topic: int, source: int, message: bytes, at_us: int) -> None:
-        """Put a publisher's new state; the same bytes once more change nothing."""
+        """Put a publisher's new state; the same publication once more changes nothing."""
         with self._lock:
             before = self._states.get((topic, source))
-            if before is None or before.message != message:
+            if before is None or (before.at_us, before.message) != (at_us, message):
                 self._renew(State(0, topic, source, message, at_us))
 
     def sources(self, topic: int) -> list[int]:
         """Publishers of the topic that have a state."""
         with self._lock:
             return [source for number, source in self._states if number == topic]
+
+    def count(self, topic: int) -> tuple[int, int]:
+        """Count the topic's states, and those of them that are owed."""
+        with self._lock:
+            owed = [not state.acked for state in self._states.values() if state.topic == topic]
+        return len(owed), sum(owed)
 
     def keep(self, topic: int, living: Collection[int]) -> None:
         """Forget states of the topic's publishers that live no more.
@@ -92,8 +99,8 @@ class Latched:
     def _renew(self, state: State) -> None:
         self._states.pop((state.topic, state.source), None)
         self._states[state.topic, state.source] = state
-        state.number, state.acked = self._number, False
-        self._number += 1
+        state.number, state.acked = self.number, False
+        self.number += 1
         if self._waiting is not None:
             loop, changed = self._waiting
             self._waiting = None

@@ -148,9 +148,10 @@ class Sender:
 
     async def _send_states(self, channel: Channel, begun: asyncio.Event) -> None:
         """Send states as they come; ``begun`` is set once all that were owed at first are sent."""
-        number = -1
+        number, first = -1, self._latched.number
         while True:
-            if self._latched.owed(number) is None:
+            state = self._latched.owed(number)
+            if state is None or state.number >= first:
                 begun.set()
             state = await self._latched.next(number)
             number = state.number

@@ -2,12 +2,14 @@
 
 import asyncio
 from dataclasses import replace
+from unittest.mock import AsyncMock
 
-from live_cases import receiving
+from live_cases import Channel, receiving
 from loop_cases import beside, until
 
 from bufgym_live.robot import PolicyQueue
 from bufgym_live.robot.channels import TcpChannel
+from bufgym_live.robot.frames import LATCHED, Frame
 from bufgym_live.robot.latched import Latched
 from bufgym_live.robot.receiver import Received
 from bufgym_live.robot.ros2.names import Published
@@ -31,14 +33,19 @@ def test_the_last_message_of_each_publisher_is_owed_until_its_ack() -> None:
     latched = Latched()
     for source, message in ((7, b"a1"), (8, b"b1"), (7, b"a2"), (8, b"b1")):
         latched.put(0, source, message, 5)
+    assert latched.count(0) == (2, 2)
     assert owed(latched) == [(8, b"b1"), (7, b"a2")]
     latched.ack(0)
     latched.ack(1)
     assert owed(latched) == [(7, b"a2")]
-    latched.put(0, 8, b"b1", 6)  # said once more
-    assert owed(latched) == [(7, b"a2")]
+    latched.put(0, 8, b"b1", 5)  # the same publication, of a new subscription
+    assert owed(latched) == [(7, b"a2")] and latched.count(0) == (2, 1)
     latched.owe_all()
     assert owed(latched) == [(8, b"b1"), (7, b"a2")]
+    for number in (1, 2):
+        latched.ack(number)
+    latched.put(0, 8, b"b1", 6)  # said once more
+    assert owed(latched) == [(8, b"b1")]
 
 
 def test_publishers_that_are_gone_are_forgotten_and_the_others_told_again() -> None:
@@ -102,6 +109,30 @@ async def test_a_connection_that_breaks_brings_only_what_is_owed() -> None:
             await until(lambda: len(channels) == 2 and latched.owed() is None)
             await asyncio.sleep(0)
     assert [one.source for one in came if one.source == 1] == [1] and 2 in [one.source for one in came]
+
+
+class Busy(Channel):
+    """A channel that sends a state only when its publisher has a newer one."""
+
+    def __init__(self, latched: Latched) -> None:
+        super().__init__(hidden=True)
+        self._latched = latched
+
+    async def send(self, frame: Frame) -> None:
+        await super().send(frame)
+        await asyncio.sleep(0)
+        if frame.kind == LATCHED:
+            self._latched.put(0, 1, b"state", frame.at_us + 1)
+
+
+async def test_states_without_end_do_not_hold_the_queue_up() -> None:
+    """The queue's message goes after those that were owed at first."""
+    latched, queue = Latched(), PolicyQueue("drop-oldest", 4)
+    latched.put(0, 1, b"state", 0)
+    queue.put(b"frame", 5)
+    channel = Busy(latched)
+    async with beside(Sender(queue, AsyncMock(return_value=channel), latched=latched).run()):
+        await until(lambda: channel.sent == [0])
 
 
 class History:

@@ -204,9 +204,12 @@ class RosSender:
         publish = publisher(node, self._say)
         while True:
             await asyncio.sleep(TELL_S)
-            numbers = zip(self._places, self._diagnostics.tell(), strict=True)
-            fault = f"not connected to {self._to}: {self._fault}" if self._fault else ""
-            publish({place.name: values for place, values in numbers if place.name is not None}, fault)
+            told = zip(self._places, self._diagnostics.tell(), strict=True)
+            numbers = {place.name: values for place, values in told if place.name is not None}
+            for topic, number, _ in self._taken.values():
+                latched, owed = self.latched.count(number)
+                numbers[topic.name] = {"latched": latched, "owed": owed}
+            publish(numbers, f"not connected to {self._to}: {self._fault}" if self._fault else "")
 
     def _names(self, node: Any) -> list[str]:
         """Names of the topics to look for; topics that a pattern fits take one of its places."""

@@ -20,13 +20,13 @@ struct State
 class Latched
 {
 public:
-  // A publisher's new state takes the place of its last one; the same bytes once more change nothing.
+  // A publisher's new state takes the place of its last one; the same publication once more changes nothing.
   void put(uint64_t source, std::shared_ptr<const std::string> body, int64_t at_us)
   {
     for (auto one = states_.begin(); one != states_.end(); ++one)
       if (one->second.source == source)
       {
-        if (*one->second.body == *body)
+        if (one->second.at_us == at_us && *one->second.body == *body)
           return;
         states_.erase(one);
         break;
