@@ -3,9 +3,9 @@
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
                      latched topics            -> Latched ----->
 
-Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor, but those of latched
-topics, whose messages are taken with their publishers (``taking``). Commands go the other
-way through a second pair with ``no_drop`` topics.
+Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Messages of latched
+topics are taken beside it, with their publishers (``taking``). Commands go the other way through a second pair with
+``no_drop`` topics.
 """
 
 import asyncio
@@ -262,8 +262,8 @@ class RosSender:
             options = {
                 "qos_overriding_options": overriding(),
                 "event_callbacks": of_subscription(topic.name, self._say),
+                "callback_group": untaken() if topic.latched else None,
             }
-            options["callback_group"] = untaken() if topic.latched else None
             kind = topic.serialized_class
             made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
             if topic.latched:
