@@ -3,6 +3,9 @@
 The sender greets with the name of its stream. The receiver answers with the largest body that it takes and the number
 of the next message that it expects. So after a broken connection no message is lost, and none that arrived is sent
 again. Each message (DATA) is then answered by an ACK with its number. A sender that has sent all says GOODBYE.
+
+Latched state (LATCHED) is no message of the queue and has numbers of its own. The receiver answers it by LATCHED with
+its number and no body. The receiver's greeting also names its run, so that a sender knows one that was restarted.
 """
 
 import contextlib
@@ -10,8 +13,8 @@ import struct
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-GREETING, DATA, ACK, GOODBYE = 1, 2, 3, 4
-_KINDS: Final = (GREETING, DATA, ACK, GOODBYE)
+GREETING, DATA, ACK, GOODBYE, LATCHED = 1, 2, 3, 4, 5
+_KINDS: Final = (GREETING, DATA, ACK, GOODBYE, LATCHED)
 
 _HEADER: Final = struct.Struct("!2sBxIQQqdI")
 """Magic, kind, bytes of the body, number, seq, time of the put in us, x, topic."""
@@ -28,11 +31,14 @@ class FrameError(ConnectionError):
 class Frame(NamedTuple):
     """One frame."""
 
-    kind: int  # GREETING, DATA, ACK or GOODBYE
+    kind: int  # GREETING, DATA, ACK, GOODBYE or LATCHED
     number: int
     """Index of the message among all that the socket dequeued; in a receiver's greeting the next one expected."""
-    seq: int = 0  # index of the message among all that were put; in a receiver's greeting the largest body in bytes
-    at_us: int = 0  # time of the put by the queue's clock
+    seq: int = 0
+    """Index of the message among all that were put; in a receiver's greeting the largest body in bytes; of latched
+    state its publisher."""
+    at_us: int = 0
+    """Time of the put by the queue's clock; in a receiver's greeting its run; of latched state its publication."""
     x: float = 0.0
     topic: int = 0
     body: bytes | memoryview = b""
@@ -54,7 +60,7 @@ def parse(data: bytes | bytearray | memoryview, max_body_bytes: int) -> tuple[Fr
     magic, kind, body_bytes, number, seq, at_us, x, topic = _HEADER.unpack_from(data)
     if magic != _MAGIC or kind not in _KINDS:
         raise FrameError(f"header {bytes(data[:3])!r}: must begin with {_MAGIC!r} and a kind of {_KINDS}")
-    most_bytes = {GREETING: STREAM_BYTES, DATA: max_body_bytes}.get(kind, 0)
+    most_bytes = {GREETING: STREAM_BYTES, DATA: max_body_bytes, LATCHED: max_body_bytes}.get(kind, 0)
     if body_bytes > most_bytes:
         raise FrameError(f"body of {body_bytes} bytes: must be at most {most_bytes}")
     return Frame(kind, number, seq, at_us, x, topic), body_bytes

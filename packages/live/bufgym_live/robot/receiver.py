@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import inspect
 import json
+import os
 import socket
 import time
 from collections import OrderedDict, deque
@@ -16,7 +17,18 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.bus_channel import BusServer
 from bufgym_live.robot.buses import BUSES, MQTT_PORT
 from bufgym_live.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
-from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, MAX_BODY_BYTES, Frame, FrameError, Room
+from bufgym_live.robot.frames import (
+    ACK,
+    DATA,
+    GOODBYE,
+    GREETING,
+    HEADER_BYTES,
+    LATCHED,
+    MAX_BODY_BYTES,
+    Frame,
+    FrameError,
+    Room,
+)
 from bufgym_live.robot.mcap_file import McapFile
 from bufgym_live.robot.sockets import BACKOFF_S, bounded_backoff, free_port, host_port
 from bufgym_live.robot.tasks import Tasks
@@ -48,6 +60,9 @@ class Received(NamedTuple):
     body: bytes | memoryview
     received_ns: int
     """Time of receipt by this system's clock."""
+    source: int | None = None
+    """Publisher of latched state, which is no message of the queue: ``number`` is its own, ``at_us`` its publication;
+    None for a message."""
 
 
 @dataclass
@@ -71,6 +86,7 @@ class Receiver:
         self.faults: deque[str] = deque(maxlen=100)
         """Why connections ended, the last 100."""
         self._on_message = on_message
+        self._run = int.from_bytes(os.urandom(7)) + 1  # the number of this receiver, another after a restart
         self._max_body_bytes = max_body_bytes
         self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
         self._room = Room(max(MAX_ARRIVING_BYTES, max_body_bytes))
@@ -145,22 +161,29 @@ class Receiver:
             _, oldest = self._streams.popitem(last=False)
             if oldest.task is not None:
                 oldest.task.cancel()
-        await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes))
+        await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes, self._run))
         while True:
             async with asyncio.timeout(IDLE_S):  # wait_for would lose a cancellation that comes with the frame
                 frame = await channel.receive()
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return
+            if frame.kind == LATCHED:
+                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns(), frame.seq))
+                await channel.send(Frame(LATCHED, frame.number))
+                continue
             if frame.kind != DATA or frame.number > stream.expected:
                 what = f"frame of kind {frame.kind}, number {frame.number}"
                 raise FrameError(f"{what}: must be message {stream.expected}")
             if frame.number == stream.expected:
-                answer = self._on_message(Received(name.hex(), *frame[1:], time.time_ns()))
-                if inspect.isawaitable(answer):
-                    await answer
+                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns()))
                 stream.expected += 1
             await channel.send(Frame(ACK, frame.number))
+
+    async def _hand_on(self, message: Received) -> None:
+        answer = self._on_message(message)
+        if inspect.isawaitable(answer):
+            await answer
 
 
 async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:

@@ -9,7 +9,8 @@ from typing import Final, Literal
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.channels import Channel
-from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, STREAM_BYTES, Frame, FrameError
+from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, LATCHED, STREAM_BYTES, Frame, FrameError
+from bufgym_live.robot.latched import Latched
 from bufgym_live.robot.path_window import PathWindow
 from bufgym_live.robot.queue import Item, PolicyQueue
 from bufgym_live.robot.tasks import until_one_ends
@@ -42,8 +43,11 @@ class Sender:
         connect: Callable[[], Awaitable[Channel]],
         leaves: Leaves = "sent",
         on_status: Callable[[str], None] = lambda fault: None,
+        latched: Latched | None = None,
     ) -> None:
         """``connect`` makes a new connection to the receiver at each call.
+
+        ``latched`` has the states that go before the queue's messages at each connection, and between them later.
 
         ``on_status`` is called with "" when the receiver has answered, and with the reason when there is no connection,
         once for as long as the reason is the same.
@@ -60,6 +64,9 @@ class Sender:
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
         self._acked = asyncio.Event()
+        self._latched = latched or Latched()
+        self._receiver = 0  # its run
+        self._writing = asyncio.Lock()
         self._window = PathWindow()
         self._max_body_bytes = 0
         self._next = 0  # the number of the message that the queue returns next
@@ -123,18 +130,40 @@ class Sender:
         if answer.kind != GREETING or answer.seq < 1:
             raise FrameError(f"frame of kind {answer.kind}: must be the answer to the greeting, and take messages")
         self._max_body_bytes = answer.seq
+        if answer.at_us != self._receiver:
+            self._receiver = answer.at_us
+            self._latched.owe_all()
         while self._unacked and self._unacked[0].number < answer.number:
             self._take_ack()
 
     async def _converse(self, channel: Channel) -> None:
         """Send and take acks until all is done."""
+        begun = asyncio.Event()
+        states, messages = self._send_states(channel, begun), self._send_all(channel, begun)
         try:
-            await until_one_ends(self._send_all(channel), self._take_acks(channel))
+            await until_one_ends(messages, states, self._take_acks(channel))
         except (OSError, TimeoutError):
             if not self._said_goodbye:
                 raise
 
-    async def _send_all(self, channel: Channel) -> None:
+    async def _send_states(self, channel: Channel, begun: asyncio.Event) -> None:
+        """Send states as they come; ``begun`` is set once all that were owed at first are sent."""
+        number, first = -1, self._latched.number
+        while True:
+            state = self._latched.owed(number)
+            if state is None or state.number >= first:
+                begun.set()
+            state = await self._latched.next(number)
+            number = state.number
+            frame = Frame(LATCHED, number, state.source, state.at_us, 0.0, state.topic, state.message)
+            await self._write(channel, frame)
+
+    async def _write(self, channel: Channel, frame: Frame) -> None:
+        async with self._writing:
+            await channel.send(frame)
+
+    async def _send_all(self, channel: Channel, begun: asyncio.Event) -> None:
+        await begun.wait()
         for unacked in list(self._unacked):
             await self._send(channel, unacked)
         while (item := await self.queue.aget()) is not None:
@@ -143,10 +172,10 @@ class Sender:
             await self._send(channel, item)
             while len(self._unacked) >= _MOST_UNACKED:
                 await self._an_ack()
-        while self._unacked:
+        while self._unacked or self._latched.owed() is not None:
             await self._an_ack()
         self._said_goodbye = True
-        await channel.send(Frame(GOODBYE, 0))
+        await self._write(channel, Frame(GOODBYE, 0))
 
     async def _send(self, channel: Channel, item: Item) -> None:
         if len(item.message) > self._max_body_bytes:
@@ -154,7 +183,8 @@ class Sender:
                 f"message {item.seq} of {len(item.message)} bytes: the receiver takes at most {self._max_body_bytes}"
             )
         self._window.sends(item.number, time.monotonic())
-        await channel.send(Frame(DATA, item.number, item.seq, item.at_us, item.x, item.topic, item.message))
+        frame = Frame(DATA, item.number, item.seq, item.at_us, item.x, item.topic, item.message)
+        await self._write(channel, frame)
         if self._leaves == "sent" and not await channel.until_wanted():
             while len(self._unacked) >= self._window.messages:
                 await self._an_ack()
@@ -168,6 +198,10 @@ class Sender:
     async def _take_acks(self, channel: Channel) -> None:
         while True:
             frame = await channel.receive()
+            if frame.kind == LATCHED:
+                self._latched.ack(frame.number)
+                self._acked.set()
+                continue
             if frame.kind != ACK or not self._unacked or frame.number != self._unacked[0].number:
                 raise FrameError(f"frame of kind {frame.kind}, number {frame.number}: must be the next ack")
             self._window.acked(frame.number, self._unacked[0].size_bytes, time.monotonic())

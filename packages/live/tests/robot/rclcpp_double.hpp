@@ -3,6 +3,7 @@
 // installed, test_ros2_node.py builds the node against it.
 #ifndef RCLCPP_DOUBLE_HPP
 #define RCLCPP_DOUBLE_HPP
+#include <algorithm>
 #include <array>
 #include <chrono>
 #include <cstdio>
@@ -19,10 +20,12 @@
 #include <rcl_interfaces/msg/parameter_descriptor.hpp>
 #include <rcl_interfaces/msg/set_parameters_result.hpp>
 #include <rmw/qos_profiles.h>
+#include <rmw/types.h>
 
 #define RCLCPP_INFO(logger, ...) \
   (static_cast<const rclcpp::Logger &>(logger), std::fprintf(stderr, __VA_ARGS__), std::fputc('\n', stderr))
 #define RCLCPP_ERROR RCLCPP_INFO
+#define RCLCPP_VERSION_GTE(major, minor, patch) (28 >= (major))
 #define RCLCPP_ERROR_THROTTLE(logger, clock, ms, ...) \
   (static_cast<rclcpp::Clock &>(clock), RCLCPP_ERROR(logger, __VA_ARGS__))
 #define RCLCPP_COMPONENTS_REGISTER_NODE(NodeClass)                                                \
@@ -220,12 +223,22 @@ template <class Allocator>
 struct SubscriptionOptionsWithAllocator {};
 using SubscriptionOptions = SubscriptionOptionsWithAllocator<std::allocator<void>>;
 
+class MessageInfo
+{
+public:
+  explicit MessageInfo(const rmw_message_info_t &rmw) : rmw_(rmw) {}
+  const rmw_message_info_t &get_rmw_message_info() const { return rmw_; }
+
+private:
+  rmw_message_info_t rmw_;
+};
+
 struct GenericSubscription
 {
   using SharedPtr = std::shared_ptr<GenericSubscription>;
   std::string topic, type;
   QoS qos;
-  std::function<void(std::shared_ptr<const SerializedMessage>)> call;
+  std::function<void(std::shared_ptr<const SerializedMessage>, const MessageInfo &)> call;
 };
 template <class M>
 struct Subscription
@@ -255,7 +268,10 @@ public:
   TopicEndpointInfo(const std::string &node, const std::string &type, const QoS &qos)
       : node_(node), type_(type), qos_(qos)
   {
+    std::copy_n(node.data(), std::min(node.size(), gid_.size()), gid_.begin());
   }
+  std::array<uint8_t, RMW_GID_STORAGE_SIZE> &endpoint_gid() { return gid_; }
+  const std::array<uint8_t, RMW_GID_STORAGE_SIZE> &endpoint_gid() const { return gid_; }
   const std::string &node_name() const { return node_; }
   const std::string &topic_type() const { return type_; }
   QoS &qos_profile() { return qos_; }
@@ -264,6 +280,7 @@ public:
 private:
   std::string node_, type_;
   QoS qos_;
+  std::array<uint8_t, RMW_GID_STORAGE_SIZE> gid_{};
 };
 }
 

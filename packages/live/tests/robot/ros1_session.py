@@ -53,7 +53,9 @@ def main(folder: str) -> None:
     came: dict[str, list[str]] = {topic: [] for topic in sizes}
     publishers = {topic: rospy.Publisher(topic, String, queue_size=size) for topic, size in sizes.items()}
     odometry = rospy.Publisher("odom", Odometry, queue_size=10)
-    for topic in sizes:
+    publishers["latched"] = rospy.Publisher("latched", String, queue_size=10, latch=True)
+    came["latched"] = []
+    for topic in came:
         rospy.Subscriber(topic, String, lambda text, topic=topic: came[topic].append(text.data))
     wait(lambda: all(one.get_num_connections() for one in (*publishers.values(), odometry)))
     # Two subscribers of one process have one connection: a raw one is the second.

@@ -1,6 +1,7 @@
 """A relay that is told all in ROS 2's own words, for test_ros2.py: prints what came, as JSON. Needs rclpy.
 
 robot: /front/camera, /scan_left, /scan_right, /odd (of a package that is nowhere installed) -> base, renamed there
+/lost is subscribed to as transient local, which it is not, and so is /scan_left by a reader at the base.
 """
 
 import json
@@ -13,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.serialization import serialize_message
-from ros2_session import BASE, ROBOT, Side, processes, start
+from ros2_session import BASE, LATCHED, ROBOT, Side, processes, start
 from std_msgs.msg import String
 
 from bufgym_live.robot.ros2.uninstalled import stand_in
@@ -32,9 +33,11 @@ def main() -> None:
     robot, base = Side(ROBOT, "robot"), Side(BASE, "base")
     publishers = {name: robot.node.create_publisher(String, name, 10) for name in ("/scan_left", "/scan_right")}
     publishers["/front/camera"] = robot.node.create_publisher(String, "/front/camera", CAREFUL)
+    publishers["/lost"] = robot.node.create_publisher(String, "/lost", 10)
     publishers["/odd"] = robot.node.create_publisher(ODD, "/odd", 10)
     for name in ("/scan_left", "/scan_right", "/robot1/camera"):
         base.hear(name, 10)
+    base.node.create_subscription(String, "/scan_left", print, LATCHED)
     odd: list[bytes] = []
     base.node.create_subscription(ODD, "/odd", odd.append, 10, raw=True)
     arrays: list[Any] = []
@@ -46,7 +49,8 @@ def main() -> None:
         names = ("-r", "__ns:=/robot", "-r", "camera:=/front/camera", "-p", "use_sim_time:=true")
         numbers = ("-p", f"host:={host}", "-p", f"port:={port}", "-p", "capacity:=7", "-p", "policy:=fifo")
         depth = ("-p", "qos_overrides./odd.subscription.reliability:=best_effort")
-        topics = ("-p", "topics:=['camera', '/scan_*', '/odd']")
+        depth += ("-p", "qos_overrides./lost.subscription.durability:=transient_local")
+        topics = ("-p", "topics:=['camera', '/scan_*', '/odd', '/lost']")
         start(ROBOT, "send", "--ros-args", *names, *numbers, *depth, *topics)
 
         def spin(what: str, holds: Callable[[], bool], publish: bool = False) -> None:
@@ -79,6 +83,12 @@ def main() -> None:
             for array in arrays[:1]
             for one in array.status
         ]
+        result["said"] = []
+        for process in processes:
+            process.terminate()
+            result["said"] += [
+                line for line in process.communicate(timeout=20)[0].splitlines() if "gets nothing" in line
+            ]
         print(json.dumps(result), flush=True)
     finally:
         for process in processes:

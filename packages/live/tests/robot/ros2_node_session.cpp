@@ -1,10 +1,11 @@
 // Drives bufgym::SenderNode over the double of rclcpp, by lines of input; each answers with one line of JSON.
 //   make NAMESPACE NAME=VALUE...      the node, with these parameters
-//   offer TOPIC TYPE NODE best_effort|reliable DEPTH          a publisher
+//   offer TOPIC TYPE NODE best_effort|reliable|latched DEPTH  a publisher
+//   gone TOPIC NODE                   it is no more
 //   configure, activate, deactivate, cleanup, shutdown        the state that follows
 //   pass SECONDS                      the subscriptions, after the timers that are due in this time
 //   set NAME VALUE                    why not, or nothing
-//   publish TOPIC COUNT BYTES HZ      how many reached a subscription, also one that the node has let go
+//   publish TOPIC COUNT BYTES HZ [NODE]   how many reached a subscription, also one that the node has let go
 //   odometry TOPIC X                  a pose at X metres
 //   diagnostics                       the newest
 //   end                               threads that are left without the node
@@ -73,9 +74,14 @@ void pass(double seconds)
   world.now = until;
 }
 
-int publish(const std::string &topic, int count, size_t bytes, double hz)
+// The publisher's id is its node's name.
+int publish(const std::string &topic, int count, size_t bytes, double hz, const std::string &node)
 {
   int reached = 0;
+  rmw_message_info_t about = {};
+  about.source_timestamp = 5000000;
+  std::copy_n(node.data(), std::min<size_t>(node.size(), RMW_GID_STORAGE_SIZE), about.publisher_gid.data);
+  const rclcpp::MessageInfo info(about);
   auto due = std::chrono::steady_clock::now();
   for (int k = 0; k < count; k++)
   {
@@ -83,7 +89,7 @@ int publish(const std::string &topic, int count, size_t bytes, double hz)
     for (const auto &one : world.subscriptions)
       if (one->topic == topic)
       {
-        one->call(message);
+        one->call(message, info);
         reached++;
       }
     std::this_thread::sleep_until(due += std::chrono::microseconds(int64_t(1e6 / hz)));
@@ -140,8 +146,16 @@ std::string answer(const std::string &command, std::istream &words)
     words >> name >> type >> who >> reliability >> count;
     rclcpp::QoS qos{rclcpp::KeepLast(count)};
     using Policy = rclcpp::ReliabilityPolicy;
-    qos.reliability(reliability == "reliable" ? Policy::Reliable : Policy::BestEffort);
+    qos.reliability(reliability == "best_effort" ? Policy::BestEffort : Policy::Reliable);
+    if (reliability == "latched")
+      qos.durability(rclcpp::DurabilityPolicy::TransientLocal);
     world.publishers.emplace(name, rclcpp::TopicEndpointInfo(who, type, qos));
+  }
+  else if (command == "gone")
+  {
+    words >> name >> who;
+    for (auto one = world.publishers.begin(); one != world.publishers.end();)
+      one = one->first == name && one->second.node_name() == who ? world.publishers.erase(one) : std::next(one);
   }
   else if (command == "pass")
   {
@@ -158,7 +172,9 @@ std::string answer(const std::string &command, std::istream &words)
   else if (command == "publish")
   {
     words >> name >> count >> bytes >> number;
-    return std::to_string(publish(name, int(count), bytes, number));
+    if (!std::getline(words >> std::ws, who))
+      who.clear();
+    return std::to_string(publish(name, int(count), bytes, number, who));
   }
   else if (command == "odometry")
   {

@@ -51,6 +51,7 @@ def test_each_subscriber_has_its_queue_and_each_topic_its_policy(ros: dict[str, 
         "plain": ["QueuedConnection"],
         "endless": ["QueuedConnection"],
         "at_once": ["TCPROSTransport"],
+        "latched": ["QueuedConnection"],
     }
     [(_, _, messages, connected)] = seen["named"]
     assert messages == 60 and connected

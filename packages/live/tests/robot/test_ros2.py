@@ -82,8 +82,13 @@ def test_the_relay_takes_ros_2s_own_words() -> None:
     assert seen["came"] == {**came, "/robot1/camera": "/front/camera"}
     assert seen["odd"] == "/odd" and seen["types"] == ["no_such_msgs/msg/Thing"]
     assert seen["by"] == ["/bufgym_receive_1", "/robot/bufgym_send"]
+    assert seen["said"] == [
+        "/scan_left: a reader here gets nothing: it asks for transient local, and a publisher of it is volatile",
+        "/lost: this relay gets nothing: it asks for transient local, and a publisher here is volatile",
+    ]
     assert seen["qos"] == [[50, 60, 70], "MANUAL_BY_TOPIC"] and seen["reliability"] == "BEST_EFFORT"
     statuses = {name: (message, numbers) for name, message, numbers in seen["diagnostics"]}
+    assert statuses.pop("/robot/bufgym_send: /lost")[1]["arrived"] == 0
     topics = ("/front/camera", "/scan_left", "/scan_right", "/odd")
     assert statuses.pop("/robot/bufgym_send: uplink") == ("connected", {})
     assert set(statuses) == {f"/robot/bufgym_send: {name}" for name in topics}

@@ -34,6 +34,7 @@ MESSAGES: Final = Path(sysconfig.get_path("data"), "include")
 """C++ of ROS 2's messages, from the wheels that rclpy needs."""
 DOUBLED: Final = (
     *("rclcpp/rclcpp.hpp", "rclcpp/create_generic_subscription.hpp", "rclcpp/detail/qos_parameters.hpp"),
+    "rclcpp/version.h",
     *("rclcpp_components/register_node_macro.hpp", "rclcpp_lifecycle/lifecycle_node.hpp"),
 )
 OFFERED: Final = (
@@ -286,3 +287,31 @@ async def test_a_node_that_starts_by_itself(node: Path, tmp_path: Path) -> None:
             assert await made(one, "topics=[camera]", f"port={port}") == 1
             assert len(await said(one, "pass 0.2")) == 1 and await said(one, "end") == 1
     assert [message.x for message in came] == [0, 1.5, 2.5]
+
+
+async def test_latched_messages_come_whole_to_each_receiver(node: Path) -> None:
+    """Of 12 drivers one says more, one starts again, and the receiver is another in the end; the queue holds one."""
+    async with receiving() as (first, port, came), talking(node) as one:
+        for k in range(12):
+            await said(one, f"offer /tf_static tf2_msgs/msg/TFMessage driver_{k} latched 1")
+        await said(one, f"make /robot topics=[/*] port={port} capacity=1")
+        assert await said(one, "pass 0.4") == [["/tf_static", "tf2_msgs/msg/TFMessage", 1000, 1, 1]]
+        for k in range(12):
+            await said(one, f"publish /tf_static 1 {10 + k} 1000 driver_{k}")
+        await until(lambda: len(came) == 12)
+        assert [len(parse(message.body)[1]) for message in came] == list(range(10, 22))
+        assert len({message.source for message in came}) == 12 and {message.at_us for message in came} == {5000}
+        assert parse(came[0].body)[0].depth == 12 and parse(came[0].body)[0].latched
+        await said(one, "publish /tf_static 1 50 1000 driver_3")
+        await until(lambda: len(came) == 13)
+        assert came[12].source == came[3].source
+        await first.close()
+        await said(one, "gone /tf_static driver_0")
+        await said(one, "offer /tf_static tf2_msgs/msg/TFMessage driver_12 latched 1")
+        await said(one, "publish /tf_static 1 60 1000 driver_12")
+        await said(one, "pass 0.4")
+        async with receiving(port) as (_, _, again):
+            await until(lambda: len(again) == 12)
+            sizes = [len(parse(message.body)[1]) for message in again]
+            assert sizes == [11, 12, *range(14, 22), 50, 60]
+            assert await said(one, "end") == 1

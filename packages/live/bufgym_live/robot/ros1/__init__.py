@@ -3,7 +3,8 @@
 ``install(policy="afr")`` or, for an unmodified node, ``python -m bufgym_live.robot.ros1 --policy afr NODE.py ARGS``.
 
 ``queue_size`` is L, and each subscriber has a queue of its own. Publishers without ``queue_size`` send at once in
-``publish``, and ``queue_size=0`` is unbounded. Both, and the topics of ``UNTOUCHED``, stay rospy's.
+``publish``, and ``queue_size=0`` is unbounded. Both, the topics of ``UNTOUCHED`` and latched ones stay rospy's: its own
+queue never drops the last message, and each new subscriber gets that.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def install(
 
     def queued(connection: Any, queue_size: int) -> Any:
         """Wrap a new subscriber's connection; replaces rospy's own wrapper."""
-        ruling = chosen.get(connection.name, policy)
+        ruling = chosen.get(connection.name, None if _latched(connection.name) else policy)
         if ruling is None or queue_size < 1:
             return QueuedConnection(connection, queue_size)
         name = f"{connection.name.strip('/').replace('/', '_')}-{next(numbers)}.mcap"
@@ -109,6 +110,13 @@ def install(
 
     rospy_topics.QueuedConnection = queued
     new_address.watch()
+
+
+def _latched(topic: str) -> bool:
+    """Whether this process's publisher of the topic gives its last message to each new subscriber."""
+    from rospy.topics import get_topic_manager
+
+    return bool(getattr(get_topic_manager().get_publisher_impl(topic), "is_latch", False))
 
 
 def _warm_up(policy: Any, value: Value) -> None:

@@ -8,7 +8,7 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError, install
@@ -43,7 +43,7 @@ class Published:
     type: str  # "sensor_msgs/msg/Image"
     reliable: bool = True
     transient_local: bool = False
-    depth: int = DEPTH
+    depth: int = DEPTH  # history depth; of a latched topic the number of its publishers
     manual: bool = False  # liveliness by topic, asserted by publishing; otherwise automatic
     deadline_ns: int = 0  # longest time between two messages; 0 is none, as in the two below
     lifespan_ns: int = 0  # age at which a message is worth nothing
@@ -54,6 +54,11 @@ class Published:
             raise BufgymError(f"topic {self.name!r}: must be a name of ROS 2 as in /camera/image")
         if not _TYPE.fullmatch(self.type) or len(self.type) > _MAX_NAME_BYTES:
             raise BufgymError(f"topic {self.name}: type {self.type!r}: must read as sensor_msgs/msg/Image")
+
+    @property
+    def latched(self) -> bool:
+        """Whether its last message of each publisher is state, owed to every late reader; a log is none."""
+        return self.transient_local and self.name != "/rosout"
 
     @property
     def qos(self) -> Any:
@@ -133,13 +138,23 @@ def parse(body: bytes | memoryview) -> tuple[Published, bytes]:
     return topic, bytes(body[end:])
 
 
+def publishers(node: Any, name: str, but_not: str) -> list[bytes]:
+    """Ids in DDS of the topic's publishers, without those of nodes with ``but_not`` in their names."""
+    return [bytes(one.endpoint_gid) for one in _publishers(node, name, but_not)]
+
+
+def _publishers(node: Any, name: str, but_not: str) -> list[Any]:
+    return [one for one in node.get_publishers_info_by_topic(name) if but_not not in one.node_name]
+
+
 def published(node: Any, name: str, but_not: str) -> Published | None:
     """Find the topic as the node sees it; None while only nodes with ``but_not`` in their names publish it.
 
     It is best effort if any publisher is, and transient local if all are, so that one subscription gets them all. So
-    with deadline, lifespan and liveliness: the weakest promise of any publisher.
+    with deadline, lifespan and liveliness: the weakest promise of any publisher. The depth of a latched topic is the
+    number of its publishers.
     """
-    found = [one for one in node.get_publishers_info_by_topic(name) if but_not not in one.node_name]
+    found = _publishers(node, name, but_not)
     if not found:
         return None
     from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
@@ -150,7 +165,7 @@ def published(node: Any, name: str, but_not: str) -> Published | None:
         longest = max(int(getattr(quality, duration).nanoseconds) for quality in qualities)
         return longest if longest < _LONGEST_NS else 0
 
-    return Published(
+    topic = Published(
         name,
         found[0].topic_type,
         all(quality.reliability == ReliabilityPolicy.RELIABLE for quality in qualities),
@@ -159,3 +174,4 @@ def published(node: Any, name: str, but_not: str) -> Published | None:
         all(quality.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC for quality in qualities),
         *map(weakest, ("deadline", "lifespan", "liveliness_lease_duration")),
     )
+    return replace(topic, depth=len(found)) if topic.latched else topic

@@ -13,7 +13,7 @@ from bufgym_live.robot.ros2.names import resolved
 
 MOST_BY_PATTERN: Final = 64
 """Topics that one pattern stands for at most; fewer where all places together would be more than ``MAX_TOPICS``."""
-_NOT_BY_PATTERN: Final = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
+_NOT_BY_PATTERN: Final = ("/rosout", "/parameter_events", "/clock", "/tf", "/diagnostics")
 
 
 @dataclass

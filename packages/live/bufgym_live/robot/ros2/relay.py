@@ -1,9 +1,11 @@
 """Relay that subscribes on the robot, sends over one uplink, and republishes at the other end.
 
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
+                     latched topics            -> Latched ----->
 
-Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Commands go the other
-way through a second pair with ``no_drop`` topics.
+Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Messages of latched
+topics are taken beside it, with their publishers (``taking``). Commands go the other way through a second pair with
+``no_drop`` topics.
 """
 
 import asyncio
@@ -20,13 +22,17 @@ from bufgym.scenario import Client
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot import LogFile, PolicyQueue
 from bufgym_live.robot.channels import TRANSPORTS
+from bufgym_live.robot.frames import MAX_BODY_BYTES
+from bufgym_live.robot.latched import Latched
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.odometry import Odometry, followed
 from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.ros2.diagnostics import Diagnostics, publisher
-from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, resolved
+from bufgym_live.robot.ros2.mismatch import of_subscription
+from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, publishers, resolved
 from bufgym_live.robot.ros2.places import left_out, places
 from bufgym_live.robot.ros2.republishing import HOLD_S, Republisher
+from bufgym_live.robot.ros2.taking import source_of, take_all, untaken
 from bufgym_live.robot.sender import Leaves, Sender
 from bufgym_live.robot.sockets import BACKOFF_S, host_port
 from bufgym_live.robot.tasks import until_one_ends
@@ -35,6 +41,7 @@ SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
 """Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
 LOOK_S: Final = 0.2  # Time between two searches for publishers
 TELL_S: Final = 1.0  # Time between two messages on /diagnostics
+LATCHED_DEPTH: Final = 1000  # Messages of a latched topic that wait to be taken: more than it has publishers
 
 
 @contextmanager
@@ -164,14 +171,16 @@ class RosSender:
             window=window or 1,
             log=record,
         )
+        self.latched = Latched()
+        self._taken: dict[str, tuple[Published, int, Any]] = {}  # latched topics, their numbers and subscriptions
         leaves: Leaves = "sent" if window is None else "acked"
         self._fault = "no answer yet"
         self._to = host_port(host, port)
-        self.sender = Sender(
-            self.queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff_s), leaves, self._on_connection
-        )
+        connect = partial(TRANSPORTS[transport], host, port, backoff_s=backoff_s)
+        self.sender = Sender(self.queue, connect, leaves, self._on_connection, self.latched)
         self._depth = capacity
         self._left_out: set[str] = set()
+        self._too_large: set[str] = set()
         self._odometry_topic: str | None
         self._odometry_topic, self._odometry = (None, Odometry()) if odometry is None else followed(odometry)
         self._say = say
@@ -184,7 +193,7 @@ class RosSender:
                 place.resolve(node)
             async with spinning(node):
                 looking = look(node, partial(self._names, node), partial(self._subscribe, node), RECEIVER, self._say)
-                await until_one_ends(self.sender.run(), looking, self._tell(node))
+                await until_one_ends(self.sender.run(), looking, self._take_latched(node), self._tell(node))
 
     def _on_connection(self, fault: str) -> None:
         self._fault = fault
@@ -195,9 +204,12 @@ class RosSender:
         publish = publisher(node, self._say)
         while True:
             await asyncio.sleep(TELL_S)
-            numbers = zip(self._places, self._diagnostics.tell(), strict=True)
-            fault = f"not connected to {self._to}: {self._fault}" if self._fault else ""
-            publish({place.name: values for place, values in numbers if place.name is not None}, fault)
+            told = zip(self._places, self._diagnostics.tell(), strict=True)
+            numbers = {place.name: values for place, values in told if place.name is not None}
+            for topic, number, _ in self._taken.values():
+                latched, owed = self.latched.count(number)
+                numbers[topic.name] = {"latched": latched, "owed": owed}
+            publish(numbers, f"not connected to {self._to}: {self._fault}" if self._fault else "")
 
     def _names(self, node: Any) -> list[str]:
         """Names of the topics to look for; topics that a pattern fits take one of its places."""
@@ -212,20 +224,50 @@ class RosSender:
         names = [place.name for place in self._places if place.name is not None]
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
+    def _fits(self, topic: Published, size_bytes: int) -> bool:
+        """Whether a receiver takes a message of this size; says so once for each topic if not."""
+        most_bytes = MAX_BODY_BYTES - len(topic.head())
+        if size_bytes > most_bytes and topic.name not in self._too_large:
+            self._too_large.add(topic.name)
+            self._say(f"{topic.name}: dropped: messages over {most_bytes} bytes, as one of {size_bytes}")
+        return size_bytes <= most_bytes
+
+    async def _take_latched(self, node: Any) -> None:
+        """Take latched topics' messages from time to time; they are no stream."""
+        while True:
+            for topic, number, subscription in self._taken.values():
+                for message, source, stamp_ns in take_all(subscription):
+                    known = self.latched.sources(number)
+                    if source not in known and len(known) >= topic.depth:
+                        self.latched.keep(number, {source_of(gid) for gid in publishers(node, topic.name, RECEIVER)})
+                    if self._fits(topic, len(message)):
+                        self.latched.put(number, source, topic.head() + message, stamp_ns // 1000)
+            await asyncio.sleep(LOOK_S)
+
     def _subscribe(self, node: Any, topic: Published) -> list[Any]:
         made = []
-        self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}")
+        self._taken.pop(topic.name, None)
+        what = ", latched" if topic.latched else ""
+        self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}{what}")
         number = next((k for k, place in enumerate(self._places) if place.name == topic.name), None)
         if number is not None:
             place, head = self._places[number], topic.head()
 
             def put(message: bytes) -> None:
                 moved = None if self._odometry_topic is None else self._odometry.x
-                self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
+                if self._fits(topic, len(message)):
+                    self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
-            deep = replace(topic, depth=max(self._depth, topic.depth)).qos
-            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+            deep = replace(topic, depth=max(LATCHED_DEPTH if topic.latched else self._depth, topic.depth)).qos
+            options = {
+                "qos_overriding_options": overriding(),
+                "event_callbacks": of_subscription(topic.name, self._say),
+                "callback_group": untaken() if topic.latched else None,
+            }
+            kind = topic.serialized_class
             made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
+            if topic.latched:
+                self._taken[topic.name] = topic, number, made[0]
         if topic.name == self._odometry_topic:
             made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
@@ -249,7 +291,8 @@ async def receive(
         receiver = Receiver(republisher)
         say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
-            await asyncio.Event().wait()
+            async with spinning(node):
+                await asyncio.Event().wait()
         finally:
             await receiver.close()
             republisher.drain()

@@ -2,7 +2,7 @@
 
 DDS drops what is published before reader and writer have found each other. The receiver acks a message when this has
 published it, so the robot would never send such a message again. A receiver that was restarted is a new writer to all
-its readers.
+its readers. Latched state waits for none: its writer keeps it for readers that come (``States``).
 """
 
 import asyncio
@@ -13,7 +13,9 @@ from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.receiver import Received
+from bufgym_live.robot.ros2.mismatch import of_publisher
 from bufgym_live.robot.ros2.names import Published, overriding, parse
+from bufgym_live.robot.ros2.states import States
 
 HOLD_S: Final = 10.0
 """Time from the start in which messages wait for readers; by then participants of DDS have found each other."""
@@ -30,9 +32,14 @@ class Republisher:
         self._hold_until_s = time.monotonic() + hold_s
         self._publishers: dict[Published, Any] = {}
         self._matched: set[Published] = set()
+        self._states: dict[str, States] = {}
 
     async def __call__(self, message: Received) -> None:
         topic, body = parse(message.body)
+        if message.source is not None:
+            states = self._states.setdefault(topic.name, States(self._made, self._node.destroy_publisher))
+            states.take(topic, message.stream, message.source, body)
+            return
         if topic not in self._publishers:
             self._publishers[topic] = self._made(topic)
         publisher = self._publishers[topic]
@@ -41,7 +48,7 @@ class Republisher:
         # Publishing comes last: a connection that ends while this waits leaves the message to the next one.
         if topic not in self._matched:
             name = publisher.topic_name
-            known = functools.partial(self._node.count_subscribers, name)
+            known = functools.partial(_readers, self._node, name, topic.qos)
             await readers_found(name, publisher.get_subscription_count, known, self._hold_until_s, self._say)
             self._matched.add(topic)
         publisher.publish(body)
@@ -49,19 +56,28 @@ class Republisher:
     def drain(self) -> None:
         """Wait until readers have acked what was published; the end of a writer takes the rest with it."""
         until_s = time.monotonic() + _MATCH_S
-        for publisher in self._publishers.values():
+        for publisher in (*self._publishers.values(), *(states.writer for states in self._states.values())):
             while publisher is not None and not _all_acked(publisher) and time.monotonic() < until_s:
                 time.sleep(_LOOK_S)
 
     def _made(self, topic: Published) -> Any:
         try:
-            kind, options = topic.serialized_class, {"qos_overriding_options": overriding()}
+            options = {"qos_overriding_options": overriding(), "event_callbacks": of_publisher(topic.name, self._say)}
+            kind = topic.serialized_class
             publisher = self._node.create_publisher(kind, topic.name, topic.qos, **options)
         except BufgymError as error:
             self._say(f"{topic.name}: dropped: {error}")
             return None
-        self._say(f"{topic.name}: {topic.type}")
+        self._say(f"{topic.name}: {topic.type}" + (f", latched by {topic.depth}" if topic.latched else ""))
         return publisher
+
+
+def _readers(node: Any, name: str, qos: Any) -> int:
+    """Count the readers that can match a publisher of this quality of service; others would be waited for in vain."""
+    from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+    asked = [one.qos_profile for one in node.get_subscriptions_info_by_topic(name)]
+    return sum(qos_check_compatible(qos, one)[0] != QoSCompatibility.ERROR for one in asked)
 
 
 async def readers_found(

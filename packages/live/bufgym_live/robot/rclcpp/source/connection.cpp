@@ -203,9 +203,20 @@ void Sender::take_acks()
   {
     if (!parse(came_.data(), frame))
       throw Fault("no frame of a receiver");
-    if (frame.kind == GREETING)
+    if (frame.kind == LATCHED)
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      latched_.ack(int64_t(frame.number));
+    }
+    else if (frame.kind == GREETING)
     {
       most_bytes_ = frame.seq;
+      if (receiver_ != frame.at_us)
+      {
+        std::lock_guard<std::mutex> lock(mutex_);
+        latched_.owe_all();
+      }
+      receiver_ = frame.at_us;
       while (!unacked_.empty() && unacked_.front().number < int64_t(frame.number))
       {
         leave(unacked_.front());
@@ -225,11 +236,14 @@ void Sender::take_acks()
 void Sender::converse()
 {
   greet();
+  last_state_ = -1;
+  send_states();
   for (const Message &message : std::deque<Message>(unacked_))
     if (!unacked_.empty() && message.number >= unacked_.front().number)
       send(message);
   for (;;)
   {
+    send_states();
     std::unique_ptr<Message> message;
     bool done = false;
     {
@@ -239,7 +253,7 @@ void Sender::converse()
         message.reset(new Message(*outgoing_));
         taken_ = true;
       }
-      done = closing_ && !outgoing_ && held_.empty() && unacked_.empty();
+      done = closing_ && !outgoing_ && held_.empty() && unacked_.empty() && !latched_.owes();
     }
     if (message)
     {
@@ -250,6 +264,22 @@ void Sender::converse()
       return write(header({GOODBYE, 0, 0, 0, 0, 0.0}), -1);
     else
       ready(0);
+  }
+}
+
+// Send the latched messages that are owed and were not yet sent on this connection.
+void Sender::send_states()
+{
+  for (;;)
+  {
+    State state;
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      if (!latched_.owed(last_state_, last_state_, state))
+        return;
+    }
+    const uint32_t size = uint32_t(state.body->size());
+    write(header({LATCHED, size, uint64_t(last_state_), state.source, state.at_us, 0.0}) + *state.body, -1);
   }
 }
 

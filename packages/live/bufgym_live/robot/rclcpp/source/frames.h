@@ -8,7 +8,7 @@
 
 namespace bufgym
 {
-enum Kind { GREETING = 1, DATA = 2, ACK = 3, GOODBYE = 4 };
+enum Kind { GREETING = 1, DATA = 2, ACK = 3, GOODBYE = 4, LATCHED = 5 };
 const size_t HEADER_BYTES = 44, STREAM_BYTES = 16;
 
 struct Frame
@@ -25,9 +25,12 @@ struct Published
 {
   std::string name, type;  // "/camera/image", "sensor_msgs/msg/Image"
   bool reliable = true, transient_local = false, manual = false;  // manual: liveliness by topic
-  uint16_t depth = 10;
+  uint16_t depth = 10;  // of a latched topic the number of its publishers
   int64_t deadline_ns = 0, lifespan_ns = 0, lease_ns = 0;  // 0: none
 };
+
+// Whether the last message of each publisher is state, owed to every late reader; a log is none.
+inline bool latched(const Published &topic) { return topic.transient_local && topic.name != "/rosout"; }
 
 inline void put_number(std::string &out, uint64_t number, int bytes)
 {
@@ -63,9 +66,10 @@ inline std::string header(const Frame &frame)
 inline bool parse(const char *data, Frame &frame)
 {
   const uint64_t kind = number_at(data + 2, 1);
-  if (data[0] != 'b' || data[1] != 'G' || (kind != GREETING && kind != ACK) || number_at(data + 4, 4))
+  const bool known = kind == GREETING || kind == ACK || kind == LATCHED;
+  if (data[0] != 'b' || data[1] != 'G' || !known || number_at(data + 4, 4))
     return false;
-  frame = {Kind(kind), 0, number_at(data + 8, 8), number_at(data + 16, 8), 0, 0.0};
+  frame = {Kind(kind), 0, number_at(data + 8, 8), number_at(data + 16, 8), int64_t(number_at(data + 24, 8)), 0.0};
   return true;
 }
 

@@ -7,6 +7,7 @@
 #include <functional>
 #include <map>
 #include <memory>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -32,7 +33,7 @@ using rclcpp_lifecycle::node_interfaces::LifecycleNodeInterface;
 
 // Patterns leave these out, which every node has or which are this node's own.
 const std::vector<std::string> NOT_BY_PATTERN = {
-    "/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics"};
+    "/rosout", "/parameter_events", "/clock", "/tf", "/diagnostics"};
 
 class SenderNode : public rclcpp_lifecycle::LifecycleNode
 {
@@ -246,11 +247,14 @@ private:
       try
       {
         Published topic;
+        std::set<uint64_t> living;
         const auto known = sendings_.find(name);
-        if (!published(*this, name, type, topic))
+        if (!published(*this, name, type, topic, living))
           continue;
         if (known == sendings_.end() || head(known->second.topic) != head(topic))
           subscribe(topic);
+        else
+          known->second.sender->keep(living);
       }
       catch (const std::exception &error)
       {
@@ -266,16 +270,19 @@ private:
     Sending sending;
     sending.topic = topic;
     sending.sender = std::make_shared<Sender>(address(), topic, *policy_, capacity_, get_parameter("log").as_string());
+    const bool state = latched(topic) && (TELLS_PUBLISHER || topic.depth == 1);
     // An executor may call it once more when the subscription is gone, and the node.
     sending.subscription = rclcpp::create_generic_subscription(
         get_node_topics_interface(), topic.name, topic.type, qos,
-        [sender = sending.sender, motion = motion_](std::shared_ptr<const rclcpp::SerializedMessage> message) {
-          const auto &data = message->get_rcl_serialized_message();
-          if (motion)
+        with_publisher([sender = sending.sender, motion = motion_, state](
+                           const auto &data, uint64_t source, int64_t at_us) {
+          if (state)
+            sender->latch(source, data.buffer, data.buffer_length, at_us);
+          else if (motion)
             sender->put(data.buffer, data.buffer_length, motion->x());
           else
             sender->put(data.buffer, data.buffer_length);
-        });
+        }));
     sendings_[topic.name] = std::move(sending);
     RCLCPP_INFO(
         get_logger(), "%s: %s, %s", topic.name.c_str(), topic.type.c_str(),

@@ -36,20 +36,44 @@ Sender::Sender(
 void Sender::put(const void *data, size_t bytes) { put_at(data, bytes, nullptr); }
 void Sender::put(const void *data, size_t bytes, double x) { put_at(data, bytes, &x); }
 
+// The head and the message; nothing once the queue is closed, or if a receiver would not take it.
+std::shared_ptr<const std::string> Sender::body(const void *data, size_t bytes)
+{
+  const int64_t size = int64_t(head_.size() + bytes);
+  if (closing_ || size > MOST_BODY_BYTES)
+  {
+    dropped_ += !closing_;
+    if (!closing_)
+      fault_ = "a message of " + std::to_string(size) + " bytes: must be at most " + std::to_string(MOST_BODY_BYTES);
+    return nullptr;
+  }
+  auto made = std::make_shared<std::string>(head_);
+  made->append(static_cast<const char *>(data), bytes);
+  return made;
+}
+
+void Sender::latch(uint64_t source, const void *data, size_t bytes, int64_t at_us)
+{
+  std::lock_guard<std::mutex> lock(mutex_);
+  if (const auto made = body(data, bytes))
+    latched_.put(source, made, at_us);
+  eventfd_write(wake_, 1);
+}
+
+void Sender::keep(const std::set<uint64_t> &living)
+{
+  std::lock_guard<std::mutex> lock(mutex_);
+  latched_.keep(living);
+  eventfd_write(wake_, 1);
+}
+
 void Sender::put_at(const void *data, size_t bytes, const double *known)
 {
-  auto body = std::make_shared<std::string>(head_);
-  body->append(static_cast<const char *>(data), bytes);
-  const int64_t size = int64_t(body->size());
   std::lock_guard<std::mutex> lock(mutex_);
-  if (closing_)
+  const auto body = this->body(data, bytes);
+  if (!body)
     return;
-  if (size > MOST_BODY_BYTES)
-  {
-    dropped_++;
-    fault_ = "a message of " + std::to_string(size) + " bytes: must be at most " + std::to_string(MOST_BODY_BYTES);
-    return;
-  }
+  const int64_t size = int64_t(body->size());
   const int64_t us = stamp(), seq = arrived_++, position = carried();
   const double x = known ? std::max(*known, latest_x_) : double(seq);
   latest_x_ = x;

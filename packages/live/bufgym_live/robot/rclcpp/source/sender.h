@@ -9,6 +9,7 @@
 #include <thread>
 
 #include "frames.h"
+#include "latched.h"
 #include "log.h"
 #include "policy.h"
 
@@ -43,6 +44,10 @@ public:
   // Put a serialized message; the policy decides at once, and nothing blocks. x must not fall; without x it counts.
   void put(const void *data, size_t bytes);
   void put(const void *data, size_t bytes, double x);
+  // Put the last message of this publisher, which no policy drops.
+  void latch(uint64_t source, const void *data, size_t bytes, int64_t at_us);
+  // Forget latched messages of publishers that are gone.
+  void keep(const std::set<uint64_t> &living);
   // Send to another receiver from now on.
   void move(const Address &to);
   Numbers numbers();
@@ -64,6 +69,8 @@ private:
   void converse();
   void greet();
   void write(const std::string &data, int64_t number);
+  std::shared_ptr<const std::string> body(const void *data, size_t bytes);
+  void send_states();
   void send(const Message &message);
   void leave(const Message &message);
   void take_acks();
@@ -78,6 +85,7 @@ private:
   Address to_;
   std::unique_ptr<Queue> queue_;
   Log log_;
+  Latched latched_;
   std::deque<Message> held_;
   std::unique_ptr<Message> outgoing_;  // dequeued by the socket, and not yet left
   bool taken_ = false;                 // the thread has taken it
@@ -93,6 +101,8 @@ private:
   std::string stream_, came_;
   std::deque<Message> unacked_;
   uint64_t most_bytes_ = 0;
+  int64_t receiver_ = 0;        // its run
+  int64_t last_state_ = -1;     // number of the latched message that this connection had last
   const std::string head_;
   std::thread thread_;
 };
