@@ -17,7 +17,6 @@ from agents.tasks import Place
 from agents.topics import AMPLE, ClientEpisodes, varied
 from bufgym import scenario as scenarios
 from bufgym.benchmark import tasks
-from bufgym.cli.options import given
 from bufgym.cli.scenarios import StreamOptions, WorkloadOptions, recorded
 from bufgym.policies import Policy
 from bufgym.scenario import suites
@@ -102,8 +101,19 @@ class Task:
         parts = []
         for part in range(1 if self.is_once else PARTS):
             chosen = [cells[k] for k in rng.permutation(len(cells))[:CELLS].tolist()]
-            parts.append([self._episodes(*cell, 1, rng, varies=part % 2 == 0, short=True) for cell in chosen])
+            parts.append([self._episodes(self._short(on, part, rng), L, 1, rng) for on, L in chosen])
         return parts
+
+    def _short(self, scenario: Any, part: int, rng: np.random.Generator) -> Any:
+        """The scenario in training: shorter with topics and in a fleet; a suite's clients vary in every second part."""
+        if self.kind == "topics":
+            short = replace(scenario, duration_s=min(scenario.duration_s, EPISODE_S))
+            # One's own client is the one that is meant; a suite's stand for others too.
+            return varied(short, rng) if part % 2 == 0 and isinstance(self.on, str) else short
+        if self.kind == "fleet":
+            uplink = replace(scenario.uplink, duration_s=min(scenario.uplink.duration_s, EPISODE_S))
+            return replace(scenario, uplink=uplink)
+        return scenario
 
     def validation(self) -> list[Episodes]:
         """Other episodes, on the suite's validation links; with topics also on links ``AMPLE`` times as fast."""
@@ -112,25 +122,12 @@ class Task:
         cells = [(scenario, L) for scenario in self.splits["validation"] for L in self.capacities]
         if self.kind == "topics" and isinstance(self.on, str):
             cells += [(replace(scenario, scale=AMPLE * scenario.scale), L) for scenario, L in cells]
-        return [self._episodes(*cell, count, rng) for cell in cells]
+        return [self._episodes(scenario, L, count, rng) for scenario, L in cells]
 
-    def _episodes(
-        self, scenario: Any, L: int, count: int, rng: np.random.Generator, varies: bool = False, short: bool = False
-    ) -> Episodes:
-        seeds = rng.integers(VALIDATION_SEED, size=count).tolist()
+    def _episodes(self, scenario: Any, L: int, count: int, rng: np.random.Generator) -> Episodes:
         if self.kind == "topics":
-            if short:
-                scenario = replace(scenario, duration_s=min(scenario.duration_s, EPISODE_S))
-            # A suite's clients stand for others too; one's own client is the one that is meant.
-            return ClientEpisodes(
-                varied(scenario, rng) if varies and isinstance(self.on, str) else scenario, L, count, rng
-            )
+            return ClientEpisodes(scenario, L, count, rng)
+        seeds = rng.integers(VALIDATION_SEED, size=count).tolist()
         if self.kind == "fleet":
-            if short:
-                uplink = replace(scenario.uplink, duration_s=min(scenario.uplink.duration_s, EPISODE_S))
-                scenario = replace(scenario, uplink=uplink)
             return FleetEpisodes(scenario, [draw(scenario, seed) for seed in seeds], L)
         return QueueEpisodes(scenario, L, seeds, self.rule)
-
-
-__all__ = ["Episodes", "QueueEpisodes", "Task", "given"]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from cli_cases import Patch
 from refusal_cases import refuse
-from weight_cases import random_weights
 
 from agents.families import Family, run_of
 from agents.mixed_env import Cell
 from bufgym import policies
 from bufgym.oracle import EveryLength, integer, law
 from bufgym.policies import weights
+from bufgym.policies.learned import Network, Weights
 from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run
@@ -89,7 +89,8 @@ def test_the_page_compares_files_with_rules_and_an_older_agent(tmp_path: Path, m
 
 
 def test_who_names_no_network_is_told(tmp_path: Path) -> None:
-    file = weights.save(tmp_path / "old.safetensors", random_weights(["rank"]), {"name": "old"})
+    nothing = Network(np.zeros(1, np.float32), np.zeros(1, np.float32), (), np.zeros(0, np.float32))
+    file = weights.save(tmp_path / "old.safetensors", Weights(("rank",), nothing, nothing), {"name": "old"})
     refuse("old.safetensors: is no network among candidates", learned.main, file)
     refuse("name at least one file", learned.main)
 

@@ -10,7 +10,6 @@ from cli_cases import Patch
 from refusal_cases import refuse
 from test_train import LEARNERS, ON
 from train_cases import in_a_folder_of_its_own  # noqa: F401
-from weight_cases import random_weights
 
 import train
 from agents import ppo, runs
@@ -20,6 +19,7 @@ from agents.learner import Learner, learner_of
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
+from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.policies.weights import save
 
 
@@ -41,6 +41,12 @@ def test_a_network_is_kept_as_a_policy_that_decides_as_it_does(algo: str) -> Non
     assert any(outcome.dropped for outcome in outcomes)
 
 
+FIRST = np.zeros((seen(3), 4), np.float32), np.zeros(4, np.float32)
+LAST = np.zeros((4, 6), np.float32), np.array([0, 0, 0, 0, 0, 1], np.float32)
+THE_RULE = RuledWeights(3, True, True, "tanh", (FIRST, LAST))
+"""Its sixth action is the highest: what gap-price does."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Still(Settings):
     """Keep the start."""
@@ -51,11 +57,11 @@ class Still(Settings):
 
 
 class StillTheRule(Learner[Still]):
-    """Learns nothing: its agent has random weights."""
+    """Learns nothing: its agent does what gap-price does."""
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> runs.Run:
         home, objective = folder / f"seed-{seed}", self.objective(folder, seed)
-        save(home / runs.MODEL, random_weights(["rank"]), self.notes(seed, "still"))
+        save(home / runs.MODEL, THE_RULE, self.notes(seed, "still"))
         run = runs.Run(seed, home, 0.0, [], [], runs.MODEL, objective.best)
         return dataclasses.replace(run, validation=[(0, 0.0, *objective.validate(self.agent(run)))])
 
@@ -69,7 +75,7 @@ def test_a_new_learner_is_a_class_and_its_settings(monkeypatch: Patch) -> None:
     assert asked == [Still(environment=dataclasses.replace(ON, episodes=200), name="tiny", validation_episodes=2)]
     (run,) = learner_of(asked[0]).train(runs.prepare(asked[0]))
     judges = FixedEpisodes(asked[0].environment, "validation", 2)
-    assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.load(run.model))])
+    assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])
     assert policies.load(run.model).name == "still"
 
 
