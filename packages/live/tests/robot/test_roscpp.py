@@ -1,5 +1,6 @@
 """roscpp's publishers under a policy, by LD_PRELOAD: real nodes in C++ on this machine, their decisions simulated."""
 
+import contextlib
 import itertools
 import os
 import signal
@@ -36,6 +37,11 @@ def master(built: Path) -> Iterator[int]:
     """The port of a master, one for all tests: each has topics of its own."""
     port = free_port("127.0.0.1")
     with subprocess.Popen(["rosmaster", "--core", "-p", str(port)], stdout=subprocess.DEVNULL) as process:
+        while True:
+            with contextlib.suppress(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port)):
+                break
+            assert process.poll() is None
+            time.sleep(0.05)
         yield port
         process.kill()
 
