@@ -90,6 +90,7 @@ FACTORS = (0.5, 0.7, 1.4, 2.0)
 """Factors on a default that is tried around."""
 
 FIXED = {
+    "gap-priority": "it is for several topics; python train.py tune finds its numbers",
     "ros-keep-last": "it stands for ROS 2 as delivered, with its default depth of 10",
     "foxglove-sdk": "it stands for the Foxglove SDK as delivered, with its default backlog of 1024 messages",
     "zenoh-drop": "it stands for Zenoh as delivered, with its default batches and waits",

@@ -13,7 +13,6 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic, check_topics
 from bufgym.scenario import Episode, messages
 from bufgym.sim import Senders, run
-from bufgym.utils import files
 
 pytestmark = pytest.mark.kernels
 V = qoi.exponential(0.618)
@@ -46,14 +45,13 @@ def test_clients():
         return policies.get(name).client
 
     assert [name for name in ALL if client(name).limit_at_send or client(name).flush_no_drop] == ["robofleet-released"]
-    assert [name for name in ALL if not client(name).awaits_acks] == ["rosbridge", "ros-native"]
+    assert [name for name in ALL if not client(name).awaits_acks] == ["ros-native", "rosbridge"]
     assert {n: client(n).encoding for n in ALL if client(n).encoding} == {"rosbridge": "json", "ros-native": "ros"}
     assert [name for name in ALL if client(name).copies] == ["ros-native"]
 
 
 def test_made_for_topics():
-    trained = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
-    assert sorted(policies.names(for_topics=True)) == sorted([*NAMES, *trained])
+    assert sorted(policies.names(for_topics=True)) == sorted([*NAMES, "gap-priority"])
     assert sorted([*policies.names(for_topics=True), *policies.names(for_topics=False)]) == sorted(policies.names())
 
 

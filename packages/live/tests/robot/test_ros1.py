@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,8 @@ def topics(monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     sys.modules["rospy.impl.tcpros_pubsub"].QueuedConnection = list  # type: ignore[attr-defined]
     sys.modules["rospy"].topics = sys.modules["rospy.topics"]  # type: ignore[attr-defined]
+    known = SimpleNamespace(get_publisher_impl=lambda topic: SimpleNamespace(is_latch=topic == "/map"))
+    sys.modules["rospy.topics"].get_topic_manager = lambda: known  # type: ignore[attr-defined]
     monkeypatch.setattr(new_address, "watch", lambda: None)  # it asks rospy itself
     monkeypatch.setattr(sys, "argv", sys.argv)
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -114,6 +116,9 @@ def test_the_node_finds_itself_as_if_run_alone(topics: Any, tmp_path: Path) -> N
     transport.name = "/other"
     assert topics.QueuedConnection.__name__ == "queued"
     with pytest.raises(TypeError):  # rospy's own, which is a list here
+        topics.QueuedConnection(transport, 3)
+    transport.name = "/map"
+    with pytest.raises(TypeError):  # a latched publisher that nobody named keeps it too
         topics.QueuedConnection(transport, 3)
     transport.name = "/camera"
     connection = topics.QueuedConnection(transport, 3)
