@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bufgym.envs.fleet_sub_envs import fleet_sub_envs
 from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options
+from bufgym.model.observe.candidates import MOST
 from bufgym.scenario import FleetScenario, Uplink
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.libraries import needs
@@ -34,9 +35,10 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     **Agents** ``robot_0`` .. ``robot_{N-1}``, N up to 256.
 
-    **Action, observation** of each robot are as in ``SenderEnv``: actions are ``Discrete(L + 2)``. The observation is
-    a Dict with one key for each field of ``bufgym.model.observe`` and holds what that robot has on board.
-    ``infos[agent]["action_mask"]``, int8[L + 2], marks the valid actions.
+    **Action, observation** of each robot are as in ``SenderEnv`` with ``actions="slots"``, the default here: there are
+    ``Discrete(L + 2)``, and the observation is a Dict with one key for each field of ``bufgym.model.observe``. With
+    ``actions="candidates"`` they are a few ordered candidates and 27 numbers, for every L. A robot observes what it has
+    on board. ``infos[agent]["action_mask"]`` marks the valid actions.
     ``state()`` has every field of every robot, for critics that may see them all.
 
     **Reward** "team" gives each robot the mean over all robots of ``term``, which is the reward of ``SenderEnv``.
@@ -81,9 +83,10 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         # PettingZoo seeds an agent by seeding its spaces, so each agent has its own.
         one = self.sub_envs.observation_space
         self.observation_spaces: Spaces = {agent: copy.deepcopy(one) for agent in self.possible_agents}
-        actions = self.sub_envs.capacity + 2
+        actions = self.sub_envs.actions_count
         self.action_spaces: Spaces = {agent: spaces.Discrete(actions) for agent in self.possible_agents}
-        self.state_space = spaces.Box(0.0, 1.0, self.state().shape, np.float32)
+        low, high = (0.0, 1.0) if self.sub_envs.choices is None else (-MOST, MOST)
+        self.state_space = spaces.Box(low, high, self.state().shape, np.float32)
         self._actions = np.zeros(len(self.sub_envs), np.int64)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:

@@ -32,7 +32,7 @@ class FleetSubEnvs(SubEnvs):
             raise BufgymError(
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
-        options.check_without_own_queue("a cell of robots")
+        options.check_without_own_link("a cell of robots")
         super().__init__(cells * scenario.robots, cast(Any, scenario), options)
         self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
@@ -70,6 +70,7 @@ class FleetSubEnvs(SubEnvs):
             actions,
             self.rewarded,
             self.output,
+            self.choices,
             self.form.named,
         )
 

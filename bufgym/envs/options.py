@@ -138,12 +138,16 @@ class Options:
         above_0("reward_scale", given, ", 'episode' or None")
         return float(given)
 
-    def check_without_own_queue(self, what: str) -> None:
+    def check_without_own_link(self, what: str) -> None:
         """Refuse options for one queue on a link of its own where the sender has ``what`` instead."""
         if self.bound:
             raise BufgymError(
                 f"bound = True: the clairvoyant is known for one queue on a link of its own, not for {what}"
             )
+
+    def check_without_own_queue(self, what: str) -> None:
+        """The same, and refuse candidates, which are of one queue."""
+        self.check_without_own_link(what)
         if self.acts_on_candidates:
             raise BufgymError(f"actions = {CANDIDATES!r}: known for one queue on a link of its own, not for {what}")
 

@@ -111,6 +111,7 @@ def step_cells(
     actions: NDArray[np.int64],
     rewarded: NDArray[np.float64],
     output: StepOutput,
+    choices: Choices | None,
     chosen: Chosen | None,
 ) -> None:
     """Take every decision that is due in ``cells``, or bring cells to their first tick, as ``step_rows`` does.
@@ -125,7 +126,10 @@ def step_cells(
         due = begins or decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             if not begins and batch.senders[i].waiting == ARRIVAL_WAITS:
-                decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
+                if choices is not None:
+                    decide(batch, i, candidate_decision(batch, i, actions[i], choices))
+                else:
+                    decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
                 if batch.senders[i].waiting == NOTHING_WAITS:
                     offer(batch, shares, i)
         if due and (begins or not decisions_due(batch, shares, c)):
@@ -133,6 +137,9 @@ def step_cells(
         ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, begins, rewarded, output)
-            write_observation(batch, i, ended, output, None)
+            if choices is not None:
+                write_candidates(batch, i, ended, output, choices)
+            else:
+                write_observation(batch, i, ended, output, None)
             if chosen is not None:
                 write_named(batch, i, chosen, output.flat)

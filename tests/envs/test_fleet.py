@@ -28,14 +28,16 @@ SMALL: dict[str, Any] = {"capacity": L, "duration_s": 2.0, "size_bytes": 600_000
 PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
 
 
-def test_one_robot_is_the_single_environment():
-    fleet, single = FleetEnv(robots=1, **SMALL), SenderEnv(**SMALL, actions="slots")
+@pytest.mark.parametrize("actions", [{"actions": "slots"}, {"actions": "candidates", "candidates": 3}])
+def test_one_robot_is_the_single_environment(actions):
+    fleet, single = FleetEnv(robots=1, **SMALL, **actions), SenderEnv(**SMALL, **actions)
+    assert fleet.action_space("robot_0") == single.action_space
     rng = np.random.default_rng(0)
     seen, infos = fleet.reset(seed=3)
     alone, info = single.reset(seed=3)
     terminated = False
     while not terminated:
-        assert all(np.array_equal(seen["robot_0"][key], alone[key]) for key in alone)
+        np.testing.assert_equal(seen["robot_0"], alone)
         assert np.array_equal(infos["robot_0"]["action_mask"], info["action_mask"])
         action = valid_action(info["action_mask"], rng)
         seen, rewards, ended, _, infos = fleet.step({"robot_0": action})
@@ -44,6 +46,22 @@ def test_one_robot_is_the_single_environment():
         assert ended == {"robot_0": terminated}
     assert infos["robot_0"].keys() == info.keys()
     assert all(infos["robot_0"][name] == info[name] for name in ("qoi", "arrived", "delivered", "dropped"))
+
+
+def test_the_cheapest_candidate_is_what_the_rule_drops():
+    """Robots that always take candidate 0 decide as min-motion-gap does: of frames of one size the gap alone counts."""
+    scenario = FleetScenario.of(3, "lte", **PARAMETERS)
+    episode = scenario.draw(Streams.seeded(1))
+    env = FleetEnv(3, scenario, L, actions="candidates")
+    _, infos = env.reset(options={"episode": episode})
+    low, high = env.state_space.low, env.state_space.high
+    while env.agents:
+        assert ((low <= env.state()) & (env.state() <= high)).all()
+        _, _, _, _, infos = env.step(dict.fromkeys(env.agents, 0))
+    fleet = run_fleet(policies.get("min-motion-gap"), [episode], L, scenario.value)
+    h = fleet.senders.batch.senders["delivered_gain"] + 1
+    assert [infos[agent]["qoi"] for agent in env.possible_agents] == pytest.approx(h.tolist())
+    assert all(infos[agent]["dropped"] > 0 for agent in env.possible_agents)
 
 
 @pytest.mark.parametrize("reward", ["team", "own"])
