@@ -3,9 +3,9 @@
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
                      latched topics            -> Latched ----->
 
-Each end is one asyncio program, which DDS wakes for each message (``taking.Hearing``). A thread of rclpy's executor does
-the rest of the robot's node. Messages of latched topics are taken from time to time, with their publishers (``taking``). Commands go the other way through a second pair with
-``no_drop`` topics.
+Each end is one asyncio program, which DDS wakes for each message (``taking.Hearing``). A thread of rclpy's executor
+does the rest. Messages of latched topics are taken from time to time, with their publishers. Commands go the
+other way through a second pair with ``no_drop`` topics.
 """
 
 import asyncio
@@ -308,7 +308,7 @@ async def receive(
     """
     with own_node(RECEIVER, ros_args) as node:
         republisher = Republisher(node, hold_s, say)
-        receiver = Receiver(republisher)
+        receiver = Receiver(republisher, expect=republisher.expect)
         say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
             async with spinning(node):
