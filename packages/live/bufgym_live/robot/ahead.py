@@ -23,48 +23,41 @@ class Ahead:
     def __init__(self, channel: Channel, expect: Callable[[bytes | memoryview], None]) -> None:
         self._channel, self._expect = channel, expect
         self._frames: deque[Frame] = deque()
-        self._coming: asyncio.Task[Frame] | None = None
+        self._waits = False
+        self._reading: asyncio.Task[None] | None = None
 
     async def receive(self) -> Frame:
         """Return the next frame."""
-        if self._frames:
-            return self._frames.popleft()
-        if self._coming is None:
-            return await self._channel.receive()
-        coming, self._coming = self._coming, None
-        return await coming
+        if not self._frames and self._reading is not None:
+            await self._reading  # it has begun with the next one, or has the reason why there is none
+        return self._frames.popleft() if self._frames else await self._channel.receive()
 
     async def during(self, work: Awaitable[Any]) -> None:
         """Wait for ``work``; receive meanwhile."""
-        working = asyncio.ensure_future(work)
+        self._waits = True
+        if self._reading is None:
+            self._reading = asyncio.create_task(self._read())
         try:
-            while not working.done():
-                await asyncio.wait([working, *self._next()], return_when=asyncio.FIRST_COMPLETED)
-                self._look()
+            await work
         finally:
-            working.cancel()
-        await working
+            self._waits = False
 
-    def _next(self) -> list[asyncio.Task[Frame]]:
-        """The task of the next frame, where one is to be received."""
-        if self._coming is None:
-            if len(self._frames) >= MOST_AHEAD or sum(len(one.body) for one in self._frames) >= MOST_AHEAD_BYTES:
-                return []
-            self._coming = asyncio.create_task(self._channel.receive())
-        return [] if self._coming.done() else [self._coming]  # one that failed is told in its turn
-
-    def _look(self) -> None:
-        if self._coming is not None and self._coming.done() and not self._coming.exception():
-            frame, self._coming = self._coming.result(), None
+    async def _read(self) -> None:
+        """Receive ahead until the work is done or there is enough; a task that failed stays, to be told of in its turn."""
+        size_bytes = sum(len(one.body) for one in self._frames)
+        while self._waits and len(self._frames) < MOST_AHEAD and size_bytes < MOST_AHEAD_BYTES:
+            frame = await self._channel.receive()
+            size_bytes += len(frame.body)
             self._frames.append(frame)
             if frame.kind == DATA:
                 self._expect(frame.body)
+        self._reading = None
 
     async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *error: object) -> None:
-        if self._coming is not None:
-            self._coming.cancel()
+        if self._reading is not None:
+            self._reading.cancel()
             with contextlib.suppress(asyncio.CancelledError, OSError):
-                await self._coming
+                await self._reading
