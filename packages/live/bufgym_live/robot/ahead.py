@@ -43,7 +43,7 @@ class Ahead:
             self._waits = False
 
     async def _read(self) -> None:
-        """Receive ahead until the work is done or there is enough; a task that failed stays, to be told of in its turn."""
+        """Receive ahead until the work is done or there is enough; a task that failed stays, and is told in turn."""
         size_bytes = sum(len(one.body) for one in self._frames)
         while self._waits and len(self._frames) < MOST_AHEAD and size_bytes < MOST_AHEAD_BYTES:
             frame = await self._channel.receive()
