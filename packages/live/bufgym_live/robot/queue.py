@@ -291,8 +291,12 @@ class PolicyQueue:
 
     def _wake(self) -> None:
         self._changed.notify_all()
+        here = asyncio._get_running_loop()
         for loop, future in self._waiting:
-            loop.call_soon_threadsafe(_resolve, future)
+            if loop is here:
+                _resolve(future)  # to wake a loop from within it takes as long as a decision
+            else:
+                loop.call_soon_threadsafe(_resolve, future)
         self._waiting.clear()
 
 

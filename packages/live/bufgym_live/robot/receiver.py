@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from bufgym.model.checks import whole
 from bufgym.utils.errors import BufgymError
+from bufgym_live.robot.ahead import Ahead
 from bufgym_live.robot.bus_channel import BusServer
 from bufgym_live.robot.buses import BUSES, MQTT_PORT
 from bufgym_live.robot.channels import TRANSPORTS, Channel, TcpChannel, WebSocketChannel
@@ -77,15 +78,20 @@ class _Talk:
 class Receiver:
     """Listens and calls ``on_message`` with each ``Received`` in its sender's order, then acks it.
 
+    Where it has to wait, ``expect`` is called with the bodies of messages that come after (``Ahead``).
     It closes the connection of a peer that breaks the protocol or sends a body larger than ``max_body_bytes``.
     """
 
     def __init__(
-        self, on_message: Callable[[Received], Awaitable[None] | None], *, max_body_bytes: int = MAX_BODY_BYTES
+        self,
+        on_message: Callable[[Received], Awaitable[None] | None],
+        *,
+        max_body_bytes: int = MAX_BODY_BYTES,
+        expect: Callable[[bytes | memoryview], None] = lambda body: None,
     ) -> None:
         self.faults: deque[str] = deque(maxlen=100)
         """Why connections ended, the last 100."""
-        self._on_message = on_message
+        self._on_message, self._expect = on_message, expect
         self._run = int.from_bytes(os.urandom(7)) + 1  # the number of this receiver, another after a restart
         self._max_body_bytes = max_body_bytes
         self._streams: OrderedDict[bytes, _Talk] = OrderedDict()
@@ -140,14 +146,15 @@ class Receiver:
                 raise ConnectionRefusedError(f"must be at most {MAX_PEERS} connections")
             async with asyncio.timeout(_GREETING_S):
                 greeting = await channel.receive()
-            await self._take(channel, greeting)
+            async with Ahead(channel, self._expect) as frames:
+                await self._take(channel, greeting, frames)
         except (OSError, TimeoutError) as error:
             self.faults.append(f"{type(error).__name__}: {error}")
         finally:
             self._peers -= 1
             channel.close()
 
-    async def _take(self, channel: Channel, greeting: Frame) -> None:
+    async def _take(self, channel: Channel, greeting: Frame, frames: Ahead) -> None:
         if greeting.kind != GREETING:
             raise FrameError(f"frame of kind {greeting.kind}: must be a greeting first")
         name = bytes(greeting.body)
@@ -164,26 +171,26 @@ class Receiver:
         await channel.send(Frame(GREETING, stream.expected, self._max_body_bytes, self._run))
         while True:
             async with asyncio.timeout(IDLE_S):  # wait_for would lose a cancellation that comes with the frame
-                frame = await channel.receive()
+                frame = await frames.receive()
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return
             if frame.kind == LATCHED:
-                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns(), frame.seq))
+                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns(), frame.seq), frames)
                 await channel.send(Frame(LATCHED, frame.number))
                 continue
             if frame.kind != DATA or frame.number > stream.expected:
                 what = f"frame of kind {frame.kind}, number {frame.number}"
                 raise FrameError(f"{what}: must be message {stream.expected}")
             if frame.number == stream.expected:
-                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns()))
+                await self._hand_on(Received(name.hex(), *frame[1:], time.time_ns()), frames)
                 stream.expected += 1
             await channel.send(Frame(ACK, frame.number))
 
-    async def _hand_on(self, message: Received) -> None:
+    async def _hand_on(self, message: Received, frames: Ahead) -> None:
         answer = self._on_message(message)
         if inspect.isawaitable(answer):
-            await answer
+            await frames.during(answer)
 
 
 async def listener(host: str, port: int, receive_buffer_bytes: int | None = None) -> socket.socket:

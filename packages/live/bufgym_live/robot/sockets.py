@@ -98,6 +98,9 @@ def is_gone(address: str) -> bool:
 
 async def until_writable(connection: Any) -> None:
     """Wait until the kernel wants more: less than ``UNSENT_BYTES`` are unsent, or the connection has ended."""
+    if is_writable(connection, 0.0):
+        await asyncio.sleep(0)  # others have a turn all the same
+        return
     loop = asyncio.get_running_loop()
     writable = asyncio.Event()
     with connection.dup() as same:  # a transport of asyncio watches the other descriptor

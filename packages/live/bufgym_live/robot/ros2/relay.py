@@ -3,9 +3,9 @@
     robot's nodes -> subscription (serialized) -> PolicyQueue -> Sender ==uplink==> Receiver -> publisher -> nodes
                      latched topics            -> Latched ----->
 
-Each end is one asyncio program; the robot's subscriptions run in a thread of rclpy's executor. Messages of latched
-topics are taken beside it, with their publishers (``taking``). Commands go the other way through a second pair with
-``no_drop`` topics.
+Each end is one asyncio program, which DDS wakes for each message (``taking.Hearing``). A thread of rclpy's executor
+does the rest. Messages of latched topics are taken from time to time, with their publishers. Commands go the
+other way through a second pair with ``no_drop`` topics.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ from bufgym_live.robot.ros2.mismatch import of_subscription
 from bufgym_live.robot.ros2.names import Published, needs_rclpy, overriding, published, publishers, resolved
 from bufgym_live.robot.ros2.places import left_out, places
 from bufgym_live.robot.ros2.republishing import HOLD_S, Republisher
-from bufgym_live.robot.ros2.taking import source_of, take_all, untaken
+from bufgym_live.robot.ros2.taking import Hearing, call_events, source_of, take_all, untaken
 from bufgym_live.robot.sender import Leaves, Sender
 from bufgym_live.robot.sockets import BACKOFF_S, host_port
 from bufgym_live.robot.tasks import until_one_ends
@@ -173,6 +173,7 @@ class RosSender:
         )
         self.latched = Latched()
         self._taken: dict[str, tuple[Published, int, Any]] = {}  # latched topics, their numbers and subscriptions
+        self._hearing: dict[str, Hearing] = {}  # other topics
         leaves: Leaves = "sent" if window is None else "acked"
         self._fault = "no answer yet"
         self._to = host_port(host, port)
@@ -193,7 +194,12 @@ class RosSender:
                 place.resolve(node)
             async with spinning(node):
                 looking = look(node, partial(self._names, node), partial(self._subscribe, node), RECEIVER, self._say)
-                await until_one_ends(self.sender.run(), looking, self._take_latched(node), self._tell(node))
+                try:
+                    beside = self._take_latched(node), self._call_events(), self._tell(node)
+                    await until_one_ends(self.sender.run(), looking, *beside)
+                finally:
+                    while self._hearing:
+                        self._hearing.popitem()[1].end()
 
     def _on_connection(self, fault: str) -> None:
         self._fault = fault
@@ -224,29 +230,41 @@ class RosSender:
         names = [place.name for place in self._places if place.name is not None]
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
 
-    def _fits(self, topic: Published, size_bytes: int) -> bool:
-        """Whether a receiver takes a message of this size; says so once for each topic if not."""
-        most_bytes = MAX_BODY_BYTES - len(topic.head())
-        if size_bytes > most_bytes and topic.name not in self._too_large:
-            self._too_large.add(topic.name)
-            self._say(f"{topic.name}: dropped: messages over {most_bytes} bytes, as one of {size_bytes}")
-        return size_bytes <= most_bytes
+    def _fits(self, name: str, head: bytes, message: bytes) -> bool:
+        """Whether a receiver takes such a message with its topic's head; says so once for each topic if not."""
+        most_bytes = MAX_BODY_BYTES - len(head)
+        if len(message) > most_bytes and name not in self._too_large:
+            self._too_large.add(name)
+            self._say(f"{name}: dropped: messages over {most_bytes} bytes, as one of {len(message)}")
+        return len(message) <= most_bytes
+
+    async def _call_events(self) -> None:
+        """Call subscriptions' events from time to time, in place of the executor."""
+        while True:
+            for subscription in [one.subscription for one in self._hearing.values()]:
+                call_events(subscription)
+            for _, _, subscription in self._taken.values():
+                call_events(subscription)
+            await asyncio.sleep(LOOK_S)
 
     async def _take_latched(self, node: Any) -> None:
         """Take latched topics' messages from time to time; they are no stream."""
         while True:
             for topic, number, subscription in self._taken.values():
+                head = topic.head()
                 for message, source, stamp_ns in take_all(subscription):
                     known = self.latched.sources(number)
                     if source not in known and len(known) >= topic.depth:
                         self.latched.keep(number, {source_of(gid) for gid in publishers(node, topic.name, RECEIVER)})
-                    if self._fits(topic, len(message)):
-                        self.latched.put(number, source, topic.head() + message, stamp_ns // 1000)
+                    if self._fits(topic.name, head, message):
+                        self.latched.put(number, source, head + message, stamp_ns // 1000)
             await asyncio.sleep(LOOK_S)
 
     def _subscribe(self, node: Any, topic: Published) -> list[Any]:
         made = []
         self._taken.pop(topic.name, None)
+        if topic.name in self._hearing:
+            self._hearing.pop(topic.name).end()
         what = ", latched" if topic.latched else ""
         self._say(f"{topic.name}: {topic.type}, {'reliable' if topic.reliable else 'best effort'}{what}")
         number = next((k for k, place in enumerate(self._places) if place.name == topic.name), None)
@@ -255,19 +273,21 @@ class RosSender:
 
             def put(message: bytes) -> None:
                 moved = None if self._odometry_topic is None else self._odometry.x
-                if self._fits(topic, len(message)):
+                if self._fits(topic.name, head, message):
                     self.queue.put(head + message, len(head) + len(message), place.x(node, moved), number)
 
             deep = replace(topic, depth=max(LATCHED_DEPTH if topic.latched else self._depth, topic.depth)).qos
             options = {
                 "qos_overriding_options": overriding(),
                 "event_callbacks": of_subscription(topic.name, self._say),
-                "callback_group": untaken() if topic.latched else None,
+                "callback_group": untaken() if topic.latched or Hearing.possible() else None,
             }
             kind = topic.serialized_class
             made.append(node.create_subscription(kind, topic.name, put, deep, raw=True, **options))
             if topic.latched:
                 self._taken[topic.name] = topic, number, made[0]
+            elif Hearing.possible():
+                self._hearing[topic.name] = Hearing(made[0], put)
         if topic.name == self._odometry_topic:
             made.append(node.create_subscription(topic.message_class, topic.name, self._odometry.take, topic.qos))
         return made
@@ -288,7 +308,7 @@ async def receive(
     """
     with own_node(RECEIVER, ros_args) as node:
         republisher = Republisher(node, hold_s, say)
-        receiver = Receiver(republisher)
+        receiver = Receiver(republisher, expect=republisher.expect)
         say(f"listening on {host_port(host, await receiver.listen(port, host, transport))}")
         try:
             async with spinning(node):

@@ -8,7 +8,7 @@ its readers. Latched state waits for none: its writer keeps it for readers that 
 import asyncio
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError
@@ -31,26 +31,41 @@ class Republisher:
         self._node, self._say = node, say
         self._hold_until_s = time.monotonic() + hold_s
         self._publishers: dict[Published, Any] = {}
-        self._matched: set[Published] = set()
+        self._found: dict[Published, asyncio.Task[None]] = {}
         self._states: dict[str, States] = {}
 
-    async def __call__(self, message: Received) -> None:
+    def __call__(self, message: Received) -> Awaitable[None] | None:
+        """Publish it, now or once its topic's readers are there."""
         topic, body = parse(message.body)
         if message.source is not None:
             states = self._states.setdefault(topic.name, States(self._made, self._node.destroy_publisher))
             states.take(topic, message.stream, message.source, body)
-            return
-        if topic not in self._publishers:
-            self._publishers[topic] = self._made(topic)
-        publisher = self._publishers[topic]
+            return None
+        publisher = self._publisher(topic)
         if publisher is None:
-            return
+            return None
+        if not self._found[topic].done():
+            return self._publish_later(publisher, body, self._found[topic])
+        publisher.publish(body)
+        return None
+
+    def expect(self, body: bytes | memoryview) -> None:
+        """Make ready for a message that comes after those that wait: its topic's readers are found meanwhile."""
+        self._publisher(parse(body)[0])
+
+    def _publisher(self, topic: Published) -> Any:
+        if topic not in self._publishers:
+            self._publishers[topic] = publisher = self._made(topic)
+            if publisher is not None:
+                name = publisher.topic_name
+                known = functools.partial(_readers, self._node, name, topic.qos)
+                finding = readers_found(name, publisher.get_subscription_count, known, self._hold_until_s, self._say)
+                self._found[topic] = asyncio.create_task(finding)
+        return self._publishers[topic]
+
+    async def _publish_later(self, publisher: Any, body: bytes, found: asyncio.Task[None]) -> None:
         # Publishing comes last: a connection that ends while this waits leaves the message to the next one.
-        if topic not in self._matched:
-            name = publisher.topic_name
-            known = functools.partial(_readers, self._node, name, topic.qos)
-            await readers_found(name, publisher.get_subscription_count, known, self._hold_until_s, self._say)
-            self._matched.add(topic)
+        await asyncio.shield(found)
         publisher.publish(body)
 
     def drain(self) -> None:
