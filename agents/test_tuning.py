@@ -152,7 +152,7 @@ def test_a_policy_of_ones_own_is_tuned(capsys: Capsys) -> None:
     """By hand: it drops the head of a full queue where ``first`` is above 2, else the newcomer, from a start of 1.9."""
     Path("own.py").write_text(
         "from bufgym import policies\n"
-        "@policies.register('own-tuned', parameters={'first': 1.9})\n"
+        "@policies.register('own-tuned', parameters={'first': 1.9}, compile=True)\n"
         "def own(buffer, arrival, memory):\n"
         "    if policies.has_space(buffer, arrival):\n"
         "        return policies.ACCEPT\n"
@@ -162,7 +162,7 @@ def test_a_policy_of_ones_own_is_tuned(capsys: Capsys) -> None:
         TINY, rule="own-tuned", parameters=(), policy_file="own.py", name="own", steps=20_000
     )
     found = tune(settings)
-    assert found.name.startswith("own-tuned") and found.parameters["first"] > 0
+    assert found.name.startswith("own-tuned:first=") and found.parameters["first"] > 2  # the head is the better one
     assert "runs/own" in capsys.readouterr().out
 
 
