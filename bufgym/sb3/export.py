@@ -27,7 +27,7 @@ def export(model: StrPath, out: StrPath, *, name: str, about: str = "") -> Path:
     """Write the agent in ``model`` to ``out``, with its training notes from the run's folder.
 
     Args:
-        model: an evolved agent's ``model.safetensors``, which gets its name and its scores; or the zip of a model of
+        model: a run's ``model.safetensors``, which gets its name and its scores; or the zip of a model of
             stable-baselines3 that chooses among candidates or has the ``SlotPolicy``. A zip holds pickles, and reading
             it can run any code: export your own alone.
         out: the file to write, .safetensors.
