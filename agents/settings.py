@@ -39,6 +39,11 @@ class RunSettings:
     """The first seed."""
 
     @property
+    def verb(self) -> str:
+        """Its command of ``train.py``, with what is typed by place."""
+        return self.algo
+
+    @property
     def every(self) -> int:
         """Steps between validations."""
         return self.validate_every or -(-self.steps // 6)
@@ -54,9 +59,9 @@ class RunSettings:
     @property
     def command(self) -> str:
         """The command that trains it again, with all settings that differ from the defaults."""
-        usual = type(self)().values  # type: ignore[call-arg]
-        changed = {name: v for name, v in self.values.items() if name not in ("name", "resume") and v != usual[name]}
-        return command_line(f"python train.py {self.algo}", **changed)
+        usual, beside = type(self)().values, ("name", "resume", "rule")  # type: ignore[call-arg]
+        changed = {name: v for name, v in self.values.items() if name not in beside and v != usual[name]}
+        return command_line(f"python train.py {self.verb}", **changed)
 
 
 @dataclass(frozen=True)
@@ -112,11 +117,9 @@ class Tune(RunSettings):
     """Python file that registers policies of your own; its code is run, so use only files you trust."""
 
     @property
-    def command(self) -> str:
-        """The command that searches again."""
-        return (
-            super().command.replace("train.py tune", f"train.py tune {self.rule}").replace(f" --rule {self.rule}", "")
-        )
+    def verb(self) -> str:
+        """With the rule, which has no option."""
+        return f"{self.algo} {self.rule}"
 
 
 @dataclass(frozen=True)

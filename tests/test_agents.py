@@ -111,19 +111,18 @@ def test_the_best_validation_is_the_earliest_of_equals(tmp_path: Path) -> None:
 
 SHIPPED = files.shipped("agents", "agents/pretrained", "*.safetensors")
 NAMED = files.shipped("agents/named", "agents/pretrained/named", "*.safetensors")
-TOPICS = files.shipped("agents/topics", "agents/pretrained/topics", "*.safetensors")
 
 
-@pytest.mark.parametrize("name", {**SHIPPED, **TOPICS, **NAMED})
+@pytest.mark.parametrize("name", {**SHIPPED, **NAMED})
 def test_its_file_is_small_and_tells_how_it_was_made(name: str) -> None:
-    file = {**SHIPPED, **TOPICS, **NAMED}[name]
+    file = {**SHIPPED, **NAMED}[name]
     _, meta = weights.read(file)
     policy = policies.get(name)
     assert file.stat().st_size < (60_000 if name not in NAMED else 200_000)
     assert meta["name"] == name and meta["training"].startswith("python train.py ")
     assert meta["seeds"] and policy.summary == meta["about"] != ""
-    assert (policy.for_topics, policy.named_only) == (name in TOPICS, name in NAMED)
-    assert name in policies.names(for_topics=name in TOPICS, named_only=name in NAMED)
+    assert (policy.for_topics, policy.named_only) == (False, name in NAMED)
+    assert name in policies.names(for_topics=False, named_only=name in NAMED)
 
 
 def test_until_the_link_has_carried_anything_learned_is_the_rule() -> None:

@@ -33,6 +33,24 @@ def advance(batch: Batch, i: int) -> None:
 
 
 @kernel
+def carry_out(batch: Batch, i: int, action: int, choices: Choices | None) -> None:
+    """Carry out the action of row ``i``, whose arrival waits for a decision."""
+    if choices is not None:
+        decide(batch, i, candidate_decision(batch, i, action, choices))
+    else:
+        decide(batch, i, decision_of(action, batch.senders[i].capacity))
+
+
+@kernel
+def show(batch: Batch, i: int, ended: bool, output: StepOutput, choices: Choices | None, chosen: Chosen | None) -> None:
+    """Write the state of row ``i`` and what it observes: candidates, or else slots as ``write_observation`` does."""
+    if choices is not None:
+        write_candidates(batch, i, ended, output, choices)
+    else:
+        write_observation(batch, i, ended, output, chosen)
+
+
+@kernel
 def step_rows(
     batch: Batch,
     rows: NDArray[np.int64],
@@ -60,19 +78,13 @@ def step_rows(
         sender = batch.senders[i]
         asks = sender.waiting
         if not begins and asks == ARRIVAL_WAITS:
-            if choices is not None:
-                decide(batch, i, candidate_decision(batch, i, actions[i], choices))
-            else:
-                decide(batch, i, decision_of(actions[i], sender.capacity))
+            carry_out(batch, i, actions[i], choices)
         if batch.several is not None and not begins and asks == SOCKET_WAITS:
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
         write_rewards(batch, i, begins, rewarded, output)
-        if choices is not None:
-            write_candidates(batch, i, sender.waiting == NOTHING_WAITS, output, choices)
-        else:
-            write_observation(batch, i, sender.waiting == NOTHING_WAITS, output, chosen)
+        show(batch, i, sender.waiting == NOTHING_WAITS, output, choices, chosen)
         if chosen is not None:
             write_named(batch, i, chosen, output.flat)
 
@@ -126,10 +138,7 @@ def step_cells(
         due = begins or decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             if not begins and batch.senders[i].waiting == ARRIVAL_WAITS:
-                if choices is not None:
-                    decide(batch, i, candidate_decision(batch, i, actions[i], choices))
-                else:
-                    decide(batch, i, decision_of(actions[i], batch.senders[i].capacity))
+                carry_out(batch, i, actions[i], choices)
                 if batch.senders[i].waiting == NOTHING_WAITS:
                     offer(batch, shares, i)
         if due and (begins or not decisions_due(batch, shares, c)):
@@ -137,9 +146,6 @@ def step_cells(
         ended = not decisions_due(batch, shares, c)
         for i in range(first, first + robots):
             write_rewards(batch, i, begins, rewarded, output)
-            if choices is not None:
-                write_candidates(batch, i, ended, output, choices)
-            else:
-                write_observation(batch, i, ended, output, None)
+            show(batch, i, ended, output, choices, None)
             if chosen is not None:
                 write_named(batch, i, chosen, output.flat)

@@ -175,7 +175,8 @@ class SubEnvs:
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
         loaded = self._load(rows, episodes)
-        same = self._begun.setdefault(len(loaded), loaded)  # a call is repeated with the same arrays
+        if (same := self._begun.get(len(loaded))) is None:  # a call is repeated with the same arrays
+            same = self._begun[len(loaded)] = np.empty_like(loaded)
         same[:] = loaded
         self._run(self._begin, same, NO_ACTIONS)
         if self._has_own:
@@ -198,7 +199,7 @@ class SubEnvs:
             self._own_fields.write(self.senders.batch, self.output)
 
     def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
-        """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step, in an array of its own.
+        """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step.
 
         An episode may be a dict of arguments for ``numbered``.
         """
@@ -219,7 +220,7 @@ class SubEnvs:
         self.senders.load_all(begun)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
-        return rows.copy()
+        return rows
 
     def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         call(step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)

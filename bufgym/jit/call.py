@@ -119,7 +119,7 @@ class Kernel:
         from bufgym.jit import code
         from bufgym.jit.values import annotated, kind_of
 
-        # One without an address must not meet the code for those that have one.
+        # C has no way to call one without an address.
         if code.noted is None and any(isinstance(a, Hook) and a.address is None for a in arguments):
             return None
         hints = inspect.get_annotations(self.py_func)

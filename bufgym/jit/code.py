@@ -46,14 +46,22 @@ class Code:
     run: Callable[[int], bytes | None]
     kinds: tuple[Kind, ...]
     result: Kind
-    struct: Any
-    gives_number: bool
+
+    @functools.cached_property
+    def struct(self) -> Any:
+        """The struct of its arguments and its result."""
+        return struct_of(self.kinds, False, self.result)
+
+    @functools.cached_property
+    def gives_number(self) -> bool:
+        """Whether its result is a number, which the struct has as Python does."""
+        return isinstance(self.result, Number)
 
     def words(self, arguments: tuple[Any, ...]) -> tuple[Any, list[Any], list[Any]]:
         """(The struct of the arguments, what it points to, (copy, array) of arrays that were copied)."""
         kept: list[Any] = []
         made = self.struct(*words(self.kinds, arguments, kept))
-        return made, kept, [pair for pair in kept if isinstance(pair, tuple)] if kept else kept
+        return made, kept, [pair for pair in kept if isinstance(pair, tuple)]
 
     def value_of(self, found: Any) -> Any:
         """The result in C as a value of Python."""
@@ -113,8 +121,7 @@ def entry(function: Any, kinds: tuple[Kind, ...], ready: bool = False) -> Code |
     run = getattr(library, symbol)
     run.argtypes, run.restype = [ctypes.c_void_p], ctypes.c_char_p
     gives = ctypes.c_char_p.in_dll(library, f"{symbol}_gives").value or b""
-    result = read(gives.decode())
-    return Code(run, kinds, result, struct_of(kinds, False, result), isinstance(result, Number))
+    return Code(run, kinds, read(gives.decode()))
 
 
 def address(function: Any, pointer: Pointer) -> int | None:

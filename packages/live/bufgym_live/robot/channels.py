@@ -60,11 +60,9 @@ class TcpChannel:
         loop = asyncio.get_running_loop()
         head, body = header(frame), memoryview(frame.body)
         self._unwritten_bytes = len(body)
-        await loop.sock_sendall(self._socket, head + body[:PIECE_BYTES])
-        self._unwritten_bytes -= len(body[:PIECE_BYTES])
-        for start in range(PIECE_BYTES, len(body), PIECE_BYTES):
+        for start in range(0, max(len(body), 1), PIECE_BYTES):
             piece = body[start : start + PIECE_BYTES]
-            await loop.sock_sendall(self._socket, piece)
+            await loop.sock_sendall(self._socket, piece if start else head + piece)
             self._unwritten_bytes -= len(piece)
 
     async def receive(self) -> Frame:

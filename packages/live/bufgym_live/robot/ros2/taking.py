@@ -67,9 +67,7 @@ def take_all(subscription: Any) -> Iterator[Taken]:
 
 def _take(subscription: Any) -> Taken | None:
     rcl, rcutils = _library("librcl.so"), _library("librcutils.so")
-    rcutils.rcutils_get_default_allocator.restype = _Allocator
-    info, data = ctypes.create_string_buffer(_INFO_BYTES), _Bytes()
-    data.allocator = rcutils.rcutils_get_default_allocator()
+    info, data = ctypes.create_string_buffer(_INFO_BYTES), _Bytes(allocator=_allocator())
     try:
         place = ctypes.c_void_p(subscription.handle.pointer)
         code = rcl.rcl_take_serialized_message(place, ctypes.byref(data), info, None)
@@ -130,6 +128,14 @@ def _library(name: str) -> Any:
         return ctypes.CDLL(name)
     except OSError as error:
         raise BufgymError(f"latched topics need rcl, which rclpy has loaded under another name: {error}") from None
+
+
+@cache
+def _allocator() -> _Allocator:
+    default = _library("librcutils.so").rcutils_get_default_allocator
+    default.restype = _Allocator
+    found: _Allocator = default()
+    return found
 
 
 @cache
