@@ -26,6 +26,12 @@ def _compiled() -> None:
         policies.warm(name)
 
 
+@pytest.fixture(autouse=True)
+def _state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Robots keep their stops in a folder of the test's own."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
 @pytest.fixture(scope="module")
 async def server(request: pytest.FixtureRequest) -> AsyncIterator[Any]:
     """The module's relay, with the settings in the module's ``CONFIG``."""
