@@ -44,7 +44,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(suites.SUITES, "fleet-v1", SUITE)
     monkeypatch.setattr(fleet, "VALIDATION_EPISODES", 1)
-    monkeypatch.setattr(FleetTask, "default_policies", lambda self, suite: ["afr", "drop-oldest"])
+    monkeypatch.setattr(FleetTask, "default_policies", lambda self: ["afr", "drop-oldest"])
 
 
 def test_team_qoi_is_what_the_benchmark_says_of_the_same_episodes() -> None:

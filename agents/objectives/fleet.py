@@ -106,4 +106,4 @@ class FleetObjective(Objective):
 
     def report(self, trained: Trained) -> Report:
         """A row of the benchmark for each agent and fixed policy in each episode of the test split."""
-        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")])
+        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies()])
