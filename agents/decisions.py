@@ -28,17 +28,15 @@ Decisions = TypeVar("Decisions", bound=SingleDecisions)
 
 
 class DecisionLearner(Learner[Decisions]):
-    """An algorithm of stable-baselines3."""
+    """An algorithm of stable-baselines3, on the flat observation of ordered candidates.
+
+    Its agent is a compiled policy for every L.
+    """
 
     @property
     @abstractmethod
     def algorithm(self) -> Any:
         """Its class, by which its file is read."""
-
-    @property
-    @abstractmethod
-    def env_options(self) -> dict[str, Any]:
-        """Options of the environment that it trains in."""
 
     @abstractmethod
     def make(self, env: VecEnv) -> Any:
@@ -53,8 +51,10 @@ class DecisionLearner(Learner[Decisions]):
         return [Budget(self.seconds, curve)]
 
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
-        """The batch of environments to train on."""
-        return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
+        """The batch of environments to train on: asked at a full buffer, where every action is valid."""
+        settings = self.settings
+        objective = self.objective(folder, seed)
+        return objective.env(settings.num_envs, settings.reward, candidates=settings.candidates, info="none")
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed for its steps or so many seconds, from its latest checkpoint if any."""
@@ -89,4 +89,4 @@ class DecisionLearner(Learner[Decisions]):
         spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
         kept = self.algorithm.load(home / "model.zip", device="cpu")
         weights.save(home / MODEL, self.weights_of(kept), self.notes(seed, settings.algo))
-        return Run(seed, home, spent, curve.record.rows, validations.rows, MODEL, validations.choose)
+        return Run(seed, home, spent, curve.record.rows, validations.rows, validations.choose)

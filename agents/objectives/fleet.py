@@ -90,7 +90,7 @@ class FleetObjective(Objective):
         return (-float(np.mean([part.measure(agent) for part in self.judges])),)
 
     def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
-        """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others."""
+        """Robots as rows, each rewarded for its own information, at the middle L; the agent serves every L."""
         chosen = self.settings.suites
         fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.suite[0])
         batch = FleetVecEnv(
@@ -101,6 +101,8 @@ class FleetObjective(Objective):
             reward="own",
             term=reward,
             autoreset_mode="SameStep",
+            actions="candidates",
+            **options,
         )
         return GymVecEnv(batch)
 
