@@ -42,14 +42,6 @@ class DecisionLearner(Learner[Decisions]):
     def make(self, env: VecEnv) -> Any:
         """Make an untrained model."""
 
-    def weights_of(self, model: Any) -> Any:
-        """The weights of the compiled policy that decides as the model does."""
-        return sb3.weights_of(model)
-
-    def callbacks(self, curve: Curve) -> list[BaseCallback]:
-        """Work between updates, besides saving and validating."""
-        return [Budget(self.seconds, curve)]
-
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
         """The batch of environments to train on: asked at a full buffer, where every action is valid."""
         settings = self.settings
@@ -71,14 +63,14 @@ class DecisionLearner(Learner[Decisions]):
         curve = Curve(home / "curve.csv", model.num_timesteps)
 
         def measure(model: Any) -> Numbers:
-            return objective.validate(self.weights_of(model).policy(settings.algo))
+            return objective.validate(sb3.weights_of(model).policy(settings.algo))
 
         validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
         validation = Validation(home, validations, measure, objective.message, curve)
         left = settings.steps - model.num_timesteps
         if left > 0:
             callbacks: list[BaseCallback] = [Checkpoints(home, settings.checkpoint_every), curve, validation]
-            callbacks += [Progress(validation, settings, seed, line), *self.callbacks(curve)]
+            callbacks += [Progress(validation, settings, seed, line), Budget(self.seconds, curve)]
             # The library counts ``total_timesteps`` from here on when the count is not reset.
             model.learn(left, callbacks, reset_num_timesteps=False)
             save(model, home)
@@ -88,5 +80,5 @@ class DecisionLearner(Learner[Decisions]):
         shutil.copyfile(checkpoint(home, int(validations.best[0])), home / "model.zip")
         spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
         kept = self.algorithm.load(home / "model.zip", device="cpu")
-        weights.save(home / MODEL, self.weights_of(kept), self.notes(seed, settings.algo))
+        weights.save(home / MODEL, sb3.weights_of(kept), self.notes(seed, settings.algo))
         return Run(seed, home, spent, curve.record.rows, validations.rows, validations.choose)
