@@ -149,7 +149,7 @@ class SingleDecisions(Settings):
         if self.kind == "fleet" and self.reward == "regret":
             raise BufgymError(
                 f"suite {self.suites.suite[0]}: nobody knows the regret of robots that share a link: give --reward "
-                "retained --gamma 0.9"
+                "retained --gamma 0.5"
             )
         if self.width > MAX_WIDTH:
             raise BufgymError(f"width = {self.width}: a file of weights has at most {MAX_WIDTH} hidden units a layer")

@@ -243,7 +243,7 @@ OR_ZERO = ("seed", "steps", "validate-every", "validation-episodes", "gamma", "g
         ("--suite lte-v1 --capacity 5", "--suite: it has environments of its own"),
         ("--capacities 5", "are of a suite, which --suite names"),
         ("--env bufgym/Interruption-v0 --size-bytes 5", "its messages have no size"),
-        ("dqn --suite fleet-v1", "regret of robots that share a link: give --reward retained --gamma 0.9"),
+        ("dqn --suite fleet-v1", "regret of robots that share a link: give --reward retained --gamma 0.5"),
         ("--suite fleet-v1", "suite fleet-v1: hindsight learns none of this kind; these do: ppo, dqn"),
         ("--suite topics-v1", "suite topics-v1: hindsight learns none of this kind; these do: tune RULE --on SUITE"),
         ("ppo --width 1000", "width = 1000: a file of weights has at most 256 hidden units a layer"),
