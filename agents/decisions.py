@@ -28,33 +28,25 @@ Decisions = TypeVar("Decisions", bound=SingleDecisions)
 
 
 class DecisionLearner(Learner[Decisions]):
-    """An algorithm of stable-baselines3."""
+    """An algorithm of stable-baselines3, on the flat observation of ordered candidates.
+
+    Its agent is a compiled policy for every L.
+    """
 
     @property
     @abstractmethod
     def algorithm(self) -> Any:
         """Its class, by which its file is read."""
 
-    @property
-    @abstractmethod
-    def env_options(self) -> dict[str, Any]:
-        """Options of the environment that it trains in."""
-
     @abstractmethod
     def make(self, env: VecEnv) -> Any:
         """Make an untrained model."""
 
-    def weights_of(self, model: Any) -> Any:
-        """The weights of the compiled policy that decides as the model does."""
-        return sb3.weights_of(model)
-
-    def callbacks(self, curve: Curve) -> list[BaseCallback]:
-        """Work between updates, besides saving and validating."""
-        return [Budget(self.seconds, curve)]
-
     def env(self, folder: Path, seed: int = 0) -> VecEnv:
-        """The batch of environments to train on."""
-        return self.objective(folder, seed).env(self.settings.num_envs, self.settings.reward, **self.env_options)
+        """The batch of environments to train on: asked at a full buffer, where every action is valid."""
+        settings = self.settings
+        objective = self.objective(folder, seed)
+        return objective.env(settings.num_envs, settings.reward, candidates=settings.candidates, info="none")
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed for its steps or so many seconds, from its latest checkpoint if any."""
@@ -71,14 +63,14 @@ class DecisionLearner(Learner[Decisions]):
         curve = Curve(home / "curve.csv", model.num_timesteps)
 
         def measure(model: Any) -> Numbers:
-            return objective.validate(self.weights_of(model).policy(settings.algo))
+            return objective.validate(sb3.weights_of(model).policy(settings.algo))
 
         validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
         validation = Validation(home, validations, measure, objective.message, curve)
         left = settings.steps - model.num_timesteps
         if left > 0:
             callbacks: list[BaseCallback] = [Checkpoints(home, settings.checkpoint_every), curve, validation]
-            callbacks += [Progress(validation, settings, seed, line), *self.callbacks(curve)]
+            callbacks += [Progress(validation, settings, seed, line), Budget(self.seconds, curve)]
             # The library counts ``total_timesteps`` from here on when the count is not reset.
             model.learn(left, callbacks, reset_num_timesteps=False)
             save(model, home)
@@ -88,5 +80,5 @@ class DecisionLearner(Learner[Decisions]):
         shutil.copyfile(checkpoint(home, int(validations.best[0])), home / "model.zip")
         spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
         kept = self.algorithm.load(home / "model.zip", device="cpu")
-        weights.save(home / MODEL, self.weights_of(kept), self.notes(seed, settings.algo))
-        return Run(seed, home, spent, curve.record.rows, validations.rows, MODEL, validations.choose)
+        weights.save(home / MODEL, sb3.weights_of(kept), self.notes(seed, settings.algo))
+        return Run(seed, home, spent, curve.record.rows, validations.rows, validations.choose)

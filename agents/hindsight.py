@@ -198,4 +198,4 @@ class HindsightLearner(Learner[Hindsight]):
             school.seconds = round(before + time.perf_counter() - began, 3)
             bar.update(school.steps - bar.n)
         bar.close()
-        return Run(seed, home, school.seconds, curve.rows, validations.rows, MODEL, objective.best)
+        return Run(seed, home, school.seconds, curve.rows, validations.rows, objective.best)

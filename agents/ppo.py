@@ -1,32 +1,18 @@
-"""stable-baselines3's own PPO and DQN among ordered candidates, and PPO on the slots of a fleet's robots."""
+"""stable-baselines3's own PPO and DQN among ordered candidates."""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import stable_baselines3 as sb3
-from sb3_contrib import MaskablePPO
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.decisions import DecisionLearner
-from agents.settings import DQN, PPO, ActorCritic, FleetPPO, OnCandidates
-from bufgym.sb3 import SlotPolicy
+from agents.settings import DQN, PPO
 from bufgym.utils.errors import BufgymError
 
-Candidates = TypeVar("Candidates", bound=OnCandidates)
 
-
-class CandidateLearner(DecisionLearner[Candidates]):
-    """An algorithm on the flat observation of ordered candidates; its agent is a compiled policy for every L."""
-
-    @property
-    def env_options(self) -> dict[str, Any]:
-        """Asked at a full buffer, where every action is valid, so nothing is masked."""
-        return {"candidates": self.settings.candidates, "info": "none"}
-
-
-class CandidatePPO(CandidateLearner[PPO]):
+class CandidatePPO(DecisionLearner[PPO]):
     """PPO with the library's own network and settings."""
 
     algorithm = sb3.PPO
@@ -34,12 +20,23 @@ class CandidatePPO(CandidateLearner[PPO]):
     def make(self, env: VecEnv) -> Any:
         """Make an untrained actor and critic."""
         settings = self.settings
-        arguments = ppo_arguments(settings, env, settings.n_steps, settings.learning_rate)
-        network = {"net_arch": [settings.width, settings.width]}
-        return sb3.PPO("MlpPolicy", env, policy_kwargs=network, **arguments)
+        return sb3.PPO(
+            "MlpPolicy",
+            env,
+            learning_rate=settings.learning_rate,
+            n_steps=settings.n_steps,
+            batch_size=even_batch(settings.n_steps * env.num_envs, settings.batch_size),
+            n_epochs=settings.epochs,
+            gamma=settings.gamma,
+            gae_lambda=settings.gae_lambda,
+            ent_coef=settings.entropy,
+            stats_window_size=env.num_envs,
+            policy_kwargs={"net_arch": [settings.width, settings.width]},
+            device="cpu",
+        )
 
 
-class CandidateDQN(CandidateLearner[DQN]):
+class CandidateDQN(DecisionLearner[DQN]):
     """DQN with the library's own network and settings.
 
     A resumed learner begins with an empty replay.
@@ -65,34 +62,6 @@ class CandidateDQN(CandidateLearner[DQN]):
             policy_kwargs={"net_arch": [settings.width, settings.width]},
             device="cpu",
         )
-
-
-class SlotPPO(DecisionLearner[FleetPPO]):
-    """PPO with action masks that chooses a slot of a robot's buffer, for all robots of a fleet."""
-
-    algorithm = MaskablePPO
-    env_options = {"actions": "slots", "decide_at": "arrival"}
-
-    def make(self, env: VecEnv) -> Any:
-        """Make an untrained actor and critic."""
-        settings = self.settings
-        arguments = ppo_arguments(settings, env, settings.n_steps, LinearSchedule(settings.learning_rate, 0.0, 1.0))
-        return MaskablePPO(SlotPolicy, env, policy_kwargs={"width": settings.width, "masked": True}, **arguments)
-
-
-def ppo_arguments(settings: ActorCritic, env: VecEnv, n_steps: int, learning_rate: Any) -> dict[str, Any]:
-    """The arguments of PPO's class that do not depend on its policy."""
-    return {
-        "learning_rate": learning_rate,
-        "n_steps": n_steps,
-        "batch_size": even_batch(n_steps * env.num_envs, settings.batch_size),
-        "n_epochs": settings.epochs,
-        "gamma": settings.gamma,
-        "gae_lambda": settings.gae_lambda,
-        "ent_coef": settings.entropy,
-        "stats_window_size": env.num_envs,
-        "device": "cpu",
-    }
 
 
 def even_batch(decisions: int, most: int) -> int:

@@ -103,7 +103,7 @@ def keep(trained: Trained, report: Callable[[Trained], Report]) -> None:
     write_notes(folder, trained.settings, seeds, notes)
     seconds = ", ".join(f"{run.seconds:.0f}" for way in (trained, *trained.beside) for run in way.runs)
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
-    print("\n".join(["next:", *NEXT.get(best.model.suffix, ())]).format(model=folder / best.model.name))
+    print("\n".join(["next:", *NEXT]).format(model=folder / best.model.name))
 
 
 def agent_name(run: Run) -> str:
@@ -111,15 +111,12 @@ def agent_name(run: Run) -> str:
     return f"agent (seed {run.seed})"
 
 
-NEXT = {
-    ".safetensors": (
-        "  bufgym play --policies {model}                # watch it decide",
-        "  bufgym bench --policies {model},learned,afr   # compare it on other episodes, links and L",
-        "  bufgym export {model} mine.safetensors --name mine",
-    ),
-    ".zip": ("  bufgym export {model} mine.safetensors --name mine   # a file that decides without torch",),
-}
-"""What to do with a model, by its kind of file."""
+NEXT = (
+    "  bufgym play --policies {model}                # watch it decide",
+    "  bufgym bench --policies {model},learned,afr   # compare it on other episodes, links and L",
+    "  bufgym export {model} mine.safetensors --name mine",
+)
+"""What to do with a model."""
 
 Report = tuple[list[int], dict[str, Any], str]
 """The seeds and scores for the notes of the kept agent, and what the folder holds."""

@@ -42,15 +42,13 @@ class Run:
     """(steps, seconds, mean QoI of the latest training episodes), a row per update."""
     validation: list[Numbers]
     """(steps, seconds, measures), a row per validation; the last measure chooses the agent to keep."""
-    file: str = "model.zip"
-    """The kept agent's file in ``folder``."""
     best: Callable[..., Any] = min
     """``min`` or ``max``, the better direction of the last measure."""
 
     @property
     def model(self) -> Path:
         """The kept agent's file."""
-        return self.folder / self.file
+        return self.folder / MODEL
 
     @property
     def reached(self) -> float:

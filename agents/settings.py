@@ -124,82 +124,60 @@ class Tune(RunSettings):
 
 @dataclass(frozen=True)
 class SingleDecisions(Settings):
-    """What all algorithms share that learn from single decisions."""
+    """What algorithms share that choose among ordered candidates at a full buffer, by the library's own settings."""
 
-    steps: Natural = 1_500_000
+    kinds = ("environment", "queue", "fleet")
+    steps: Natural = 200_000
     """Decisions to learn from, for each seed."""
-    reward: Literal["regret", "retained", "delivered"] = "retained"
-    width: Count = 32
-    """Hidden units a layer."""
-    num_envs: Count = 256
-    """Environments side by side."""
-    batch_size: Batch = 1024
+    reward: Literal["regret", "retained", "delivered"] = "regret"
+    """regret knows the future, which only the reward does; it needs messages of equal size, and no fleet."""
+    candidates: Count = 2
+    """k: how many of the cheapest candidates the agent chooses among, beside the head."""
+    width: Count = 64
+    """Hidden units of both layers."""
+    num_envs: Count = 8
+    """Environments side by side; a fleet's robots in whole cells."""
+    batch_size: Batch = 64
     """Decisions of one gradient step."""
-    learning_rate: Positive = 1e-3
-    """At the start; falls linearly to 0."""
-    gamma: Share = 0.9
-    """``retained`` pays at once what a decision costs, so a short sight suffices and keeps the noise of motion out."""
-    checkpoint_every: Count = 250_000
+    learning_rate: Positive = 3e-4
+    gamma: Share = 0.99
+    checkpoint_every: Count = 50_000
     """Steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind == "fleet" and self.reward == "regret":
+            raise BufgymError(
+                f"suite {self.suites.suite[0]}: nobody knows the regret of robots that share a link: give --reward "
+                "retained --gamma 0.5"
+            )
+        if self.width > MAX_WIDTH:
+            raise BufgymError(f"width = {self.width}: a file of weights has at most {MAX_WIDTH} hidden units a layer")
 
 
 @dataclass(frozen=True)
-class ActorCritic(SingleDecisions):
-    """What both kinds of PPO share."""
+class PPO(SingleDecisions):
+    """Train by stable-baselines3's PPO, with its own settings, among ordered candidates."""
 
-    n_steps: Count = 32
-    """Steps in each environment between updates."""
-    epochs: Count = 3
+    algo = "ppo"
+    learner = "agents.ppo:CandidatePPO"
+    n_steps: Count = 256
+    """Steps in each environment between updates: with 8, as many decisions an update as the library has with one."""
+    epochs: Count = 10
     """Passes over the decisions of an update."""
-    gae_lambda: Share = 0.9
+    gae_lambda: Share = 0.95
     entropy: Least0 = 0.0
     """Weight of the entropy bonus."""
 
 
 @dataclass(frozen=True)
-class OnCandidates(SingleDecisions):
-    """What algorithms share that choose among ordered candidates at a full buffer, by the library's own settings."""
-
-    kinds = ("environment", "queue")
-    steps: Natural = 200_000
-    """Decisions to learn from, for each seed."""
-    reward: Literal["regret", "retained", "delivered"] = "regret"
-    """regret knows the future, which only the reward does; it needs messages of equal size."""
-    candidates: Count = 2
-    """k: how many of the cheapest candidates the agent chooses among, beside the head."""
-    width: Count = 64
-    """Hidden units of both layers."""
-    gamma: Share = 0.99
-    checkpoint_every: Count = 50_000
-    """Steps."""
-
-
-@dataclass(frozen=True)
-class PPO(OnCandidates, ActorCritic):
-    """Train by stable-baselines3's PPO, with its own settings, among ordered candidates."""
-
-    algo = "ppo"
-    learner = "agents.ppo:CandidatePPO"
-    num_envs: Count = 8
-    """Environments side by side."""
-    n_steps: Count = 256
-    """Steps in each environment between updates: with 8, as many decisions an update as the library has with one."""
-    batch_size: Batch = 64
-    """Decisions of one gradient step."""
-    epochs: Count = 10
-    """Passes over the decisions of an update."""
-    learning_rate: Positive = 3e-4
-    gae_lambda: Share = 0.95
-
-
-@dataclass(frozen=True)
-class DQN(OnCandidates):
+class DQN(SingleDecisions):
     """Train by stable-baselines3's DQN, with its own settings, among ordered candidates."""
 
     algo = "dqn"
     learner = "agents.ppo:CandidateDQN"
     num_envs: Count = 1
-    """Environments side by side."""
+    """Environments side by side; a fleet's robots in whole cells."""
     batch_size: Batch = 32
     """Decisions of one gradient step."""
     learning_rate: Positive = 1e-4
@@ -213,29 +191,6 @@ class DQN(OnCandidates):
     """Decisions before the first update."""
     target_update_interval: Count = 10_000
     """Decisions between two copies of the network to the target network."""
-
-
-@dataclass(frozen=True)
-class FleetPPO(ActorCritic):
-    """Train by PPO with action masks on the slots of every robot's buffer, for a fleet (--suite fleet-v1)."""
-
-    algo = "fleet-ppo"
-    learner = "agents.ppo:SlotPPO"
-    kinds = ("fleet",)
-    suites: Annotated[Suites, FLAT] = Suites(("fleet-v1",))
-    steps: Natural = 600_000
-    """Decisions to learn from, for each seed."""
-    num_envs: Count = 64
-    """Environments side by side. Many small updates learn more than few large ones."""
-    batch_size: Batch = 512
-    """Decisions of one gradient step."""
-    learning_rate: Positive = 2e-3
-    """At the start; falls linearly to 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.width > MAX_WIDTH:
-            raise BufgymError(f"width = {self.width}: a file of weights has at most {MAX_WIDTH} hidden units a layer")
 
 
 @dataclass(frozen=True)
@@ -292,5 +247,5 @@ class Hindsight(Settings):
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
 
 
-ALGORITHMS: tuple[type[Settings], ...] = (PPO, DQN, FleetPPO, Hindsight)
+ALGORITHMS: tuple[type[Settings], ...] = (PPO, DQN, Hindsight)
 """Commands of ``train.py``. A new learner is a file with a ``Learner`` (``agents.learner``) and an entry here."""

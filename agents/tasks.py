@@ -125,3 +125,10 @@ class Place:
     """Folder of recordings, for suites that need one."""
     capacity: Capacities = ()
     """L, such as 5,10,25 (default: 8, with topics 32, or the suite's)."""
+
+    def __post_init__(self) -> None:
+        is_suite = self.on in suites.SUITES
+        if is_suite and (self.workload is not None or self.trace):
+            raise BufgymError(f"suite {self.on}: has streams and links of its own, so no --workload and no --trace")
+        if self.data is not None and (not is_suite or self.workload is not None):
+            raise BufgymError("--data is of a suite, which --on names")

@@ -64,6 +64,16 @@ def test_what_is_searched() -> None:
     refuse("policy target-gap: is a drop rule of one queue, and topics-v1 has several topics", tune, fifo)
 
 
+def test_options_that_a_place_has_no_use_for_are_refused() -> None:
+    own = "suite lte-v1: has streams and links of its own, so no --workload and no --trace"
+    refuse(own, Place, "lte-v1", workload="drive.csv")
+    refuse(own, Place, "lte-v1", trace=("4Mbit/s",))
+    nobodys = "--data is of a suite, which --on names"
+    refuse(nobodys, Place, data="recordings")
+    refuse(nobodys, Place, workload="drive.csv", data="recordings")
+    assert Place("lte-belgium-v1", data="recordings").data == "recordings"
+
+
 def by_metrics(policy: policies.Policy, of: topics.ClientEpisodes) -> tuple[float, float, float, int]:
     """What ``reached`` says, from the statistics of ordinary runs."""
     topics = of.client.topics

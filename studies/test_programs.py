@@ -40,7 +40,6 @@ ELSEWHERE = {
     "studies.shipped": "studies/test_shipped.py",
     "studies.sizes": "needs a recording, and PyAV",
     "studies.ten_minutes": "studies/test_ten_minutes.py, and it needs the other libraries",
-    "studies.tune": "studies/test_tune.py",
     "website.films": "website/test_gallery.py",
     "website.interfaces": "website/test_interfaces.py",
     "website.previews": "website/test_previews.py",

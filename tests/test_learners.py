@@ -37,7 +37,7 @@ def test_a_network_is_kept_as_a_policy_that_decides_as_it_does(algo: str) -> Non
         reached[live & ended] = info["qoi"][live & ended]
         live &= ~ended
     outcomes = test.play(learner.agent(run))
-    assert run.file == runs.MODEL and [outcome.qoi for outcome in outcomes] == pytest.approx(reached)
+    assert [outcome.qoi for outcome in outcomes] == pytest.approx(reached)
     assert any(outcome.dropped for outcome in outcomes)
 
 
@@ -62,7 +62,7 @@ class StillTheRule(Learner[Still]):
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> runs.Run:
         home, objective = folder / f"seed-{seed}", self.objective(folder, seed)
         save(home / runs.MODEL, THE_RULE, self.notes(seed, "still"))
-        run = runs.Run(seed, home, 0.0, [], [], runs.MODEL, objective.best)
+        run = runs.Run(seed, home, 0.0, [], [], objective.best)
         return dataclasses.replace(run, validation=[(0, 0.0, *objective.validate(self.agent(run)))])
 
 

@@ -90,7 +90,7 @@ class FleetObjective(Objective):
         return (-float(np.mean([part.measure(agent) for part in self.judges])),)
 
     def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
-        """Robots as rows, each rewarded for its own information, at the middle L; a slot network serves the others."""
+        """Robots as rows, each rewarded for its own information, at the middle L; the agent serves every L."""
         chosen = self.settings.suites
         fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.suite[0])
         batch = FleetVecEnv(
@@ -101,9 +101,11 @@ class FleetObjective(Objective):
             reward="own",
             term=reward,
             autoreset_mode="SameStep",
+            actions="candidates",
+            **options,
         )
         return GymVecEnv(batch)
 
     def report(self, trained: Trained) -> Report:
         """A row of the benchmark for each agent and fixed policy in each episode of the test split."""
-        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies("")])
+        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies()])

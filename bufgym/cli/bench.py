@@ -96,7 +96,7 @@ def bench(
         if drops is not None and workload.workload is None:
             raise BufgymError("--drops needs --workload")
         experiment = _on_scenario(options, buffer, who.seeds)
-    entrants, rival = who.entrants(experiment.task, suite.suite), who.rival()
+    entrants, rival = who.entrants(experiment.task), who.rival()
     topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
     file, folder, page = out.file(), out.folder(), out.page()
     capacity = who.capacity or (() if suite.suite else (experiment.task.capacity,))

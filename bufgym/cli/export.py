@@ -22,8 +22,8 @@ def export(model: str, /, out: str, *, weights: WeightOptions = WeightOptions())
     A model.zip holds pickles, so reading it can run any code: export models of your own alone.
 
     Args:
-        model: Of a run of train.py: model.safetensors, or model.zip (fleet-ppo). Or the zip of your own PPO,
-            A2C, DQN or MaskablePPO with MlpPolicy among candidates.
+        model: The model.safetensors of a run, or the zip of your own PPO, A2C, DQN or MaskablePPO with MlpPolicy
+            among candidates.
         out: File to write.
     """
     from bufgym import sb3

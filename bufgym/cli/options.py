@@ -108,7 +108,7 @@ class SuiteOptions:
 @dataclass(frozen=True)
 class WhoOptions:
     policies: list[str] | None = None
-    """Policies, as in afr,decimate:every=2 (default: all that the task takes, or the suite's); also mine.safetensors,
+    """Policies, as in afr,decimate:every=2 (default: all that the task takes); also mine.safetensors,
     mine.zip of stable-baselines3 or sb3-contrib, and module:function (a policy, or what makes one; from the current
     folder too): a zip and a module run code, so use only what you trust."""
     capacity: Capacities | None = None
@@ -120,9 +120,9 @@ class WhoOptions:
     """Compare every policy with this one, by the paired difference of their shares of AFR's regret (of QoI over
     Robofleet's with topics, of the gain over AFR with a fleet)."""
 
-    def entrants(self, task: Task, suite: str | None) -> list[Policy]:
-        """The policies of ``--policies``, or those that the task takes, on this suite."""
-        return policies_of(self.policies or task.default_policies(suite or ""))
+    def entrants(self, task: Task) -> list[Policy]:
+        """The policies of ``--policies``, or those that the task takes."""
+        return policies_of(self.policies or task.default_policies())
 
     def rival(self) -> Policy | None:
         """The policy of ``--against``."""

@@ -44,7 +44,7 @@ def leaderboard(
     from bufgym.scenario.suites import SUITES
 
     names = suites or [name for name, suite in SUITES.items() if not suite.needs or data]
-    board = boards.make(file, {name: task_of(name).default_policies(name) for name in names}, data=data, jobs=jobs)
+    board = boards.make(file, {name: task_of(name).default_policies() for name in names}, data=data, jobs=jobs)
     print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
 
 

@@ -34,6 +34,8 @@ class FleetSubEnvs(SubEnvs):
             )
         options.check_without_own_link("a cell of robots")
         super().__init__(cells * scenario.robots, cast(Any, scenario), options)
+        if self._regret is not None:
+            raise BufgymError("term 'regret': known for one queue on a link of its own, not for a cell of robots")
         self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
         self._threads = Threads(np.arange(cells), options.num_threads)
@@ -97,11 +99,11 @@ class FleetVecEnv(SenderVectorEnv):
     Any learner for one robot thus trains weights that all robots of a fleet share, each deciding from its own
     observation:
 
-        from sb3_contrib import MaskablePPO
+        from stable_baselines3 import PPO
         from bufgym.sb3 import GymVecEnv
 
-        envs = GymVecEnv(FleetVecEnv(cells=16, robots=4, autoreset_mode="SameStep"))
-        MaskablePPO("MultiInputPolicy", envs).learn(1_000_000)
+        rows = FleetVecEnv(cells=1, robots=16, actions="candidates", reward="own", autoreset_mode="SameStep")
+        PPO("MlpPolicy", GymVecEnv(rows), n_steps=128, gamma=0.9).learn(150_000)
 
     **Action, observation, episode end** of each robot and the other arguments are as in ``SenderVectorEnv``, with these
     differences. The robots of a cell begin and end together. ``reset(seed=s)`` seeds cell c with s + c N.

@@ -48,8 +48,8 @@ by that, and a queue with one place at every arrival:
     if the link is steady, and soon or L = 1:
         if the message behind the head lies nearer to e than the head: drop the head
 
-The numbers are the policy's parameters. ``python -m agents.tune SUITE --policies target-gap --split train`` finds them
-again. The other constants are structural, and are not tuned.
+The numbers are the policy's parameters. ``python train.py tune target-gap --on SUITE`` searches them again. The other
+constants are structural, and are not tuned.
 """
 
 from typing import Any

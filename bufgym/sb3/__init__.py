@@ -1,12 +1,12 @@
 """stable-baselines3 and sb3-contrib on bufgym: a vector environment, the slot network, trained models as policies.
 
-    from sb3_contrib import MaskablePPO
-    from bufgym.sb3 import SlotPolicy, as_policy, make_vec_env
+    from stable_baselines3 import PPO
+    from bufgym.sb3 import as_policy, make_vec_env
 
-    model = MaskablePPO(SlotPolicy, make_vec_env("bufgym/Uplink-v0", 256, capacity=8)).learn(1_000_000)
+    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v0", 8, reward="regret"), n_steps=256).learn(200_000)
     policy = as_policy(model, "mine")  # runs wherever the built-in policies do
 
-``export`` (or ``bufgym export``) writes a slot network to a file that bufgym runs without torch.
+``export`` (or ``bufgym export``) writes its network to a file that bufgym runs without torch.
 """
 
 from bufgym.utils.libraries import needs

@@ -4,9 +4,9 @@ stable-baselines3 itself batches single environments, with one Python call per s
 it a ``gymnasium.vector.VectorEnv`` instead, so a compiled batch stays one call:
 
     from bufgym.sb3 import make_vec_env
-    from sb3_contrib import MaskablePPO
+    from stable_baselines3 import PPO
 
-    model = MaskablePPO("MultiInputPolicy", make_vec_env("bufgym/Uplink-v0", 256, seed=0), batch_size=4096)
+    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v0", 8, seed=0), n_steps=256)
 """
 
 import inspect

@@ -163,6 +163,7 @@ def test_pictures_have_a_line_and_a_bar_for_every_robot():
 test_bad_input_is_told_apart = refused(
     (lambda: FleetEnv(reward="all"), "reward = 'all': must be 'team'"),
     (lambda: FleetEnv(term="speed"), "unknown term 'speed'"),
+    (lambda: FleetVecEnv(actions="candidates", term="regret"), "term 'regret': .*, not for a cell of robots"),
     (lambda: FleetEnv(bound=True), "bound = True: .*, not for a cell of robots"),
     (lambda: FleetVecEnv(frameskip=1), "unexpected keyword argument 'frameskip'", TypeError),
     (lambda: begun().step({"robot_0": 0, "robot_1": 1.7}), r"actions\['robot_1'\] = 1.7: must be a whole number"),

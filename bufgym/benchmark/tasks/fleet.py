@@ -47,7 +47,7 @@ class FleetTask(Task):
         "Robots above, below: with a larger or smaller H than the same robot under AFR. Fairness: Jain's index of H.",
     )
 
-    def default_policies(self, suite: str) -> list[str]:
+    def default_policies(self) -> list[str]:
         """The ranked policies for one queue."""
         return [name for name in names(for_topics=False) if get(name).ranked]
 

@@ -15,7 +15,6 @@ from bufgym.benchmark.score import REFERENCE, scores
 from bufgym.benchmark.summary import Quantity, Summary, difference, table_over
 from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Table, Unranked, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
-from bufgym.benchmark.tuned import tuned
 from bufgym.oracle import Plan, clairvoyant
 from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import BASELINE, TIE, regret
@@ -56,12 +55,12 @@ class QueueTask(Task):
     listed = ("score", "regret", "improvement")
     shows_baseline = False
 
-    def default_policies(self, suite: str) -> list[str]:
-        """List all policies for one queue with their sources' parameters, and the variants tuned on the suite."""
+    def default_policies(self) -> list[str]:
+        """All policies for one queue with their sources' parameters."""
         able = list(registry.names(for_topics=False))
         if self.decide_at != "arrival":  # see ``check``
             able = [name for name in able if registry.get(name).privileged is None]
-        return [*able, *tuned(suite)]
+        return able
 
     def check(self, policy: Policy) -> None:
         if policy.privileged is not None and self.decide_at != "arrival":

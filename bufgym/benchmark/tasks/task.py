@@ -35,8 +35,8 @@ class Task(ABC):
     shows_baseline: ClassVar[bool] = True  # whether tables and rows have the baseline where nobody named it
 
     @abstractmethod
-    def default_policies(self, suite: str) -> list[str]:
-        """The policies that run on a suite unless the caller says otherwise."""
+    def default_policies(self) -> list[str]:
+        """The policies that run unless the caller says otherwise."""
 
     def check(self, policy: Policy) -> None:
         """Raise an error for a policy that can't take part."""

@@ -63,7 +63,7 @@ class TopicsTask(Task):
         "The QoI of an unbounded queue counts messages that arrive long after the others.",
     )
 
-    def default_policies(self, suite: str) -> list[str]:
+    def default_policies(self) -> list[str]:
         """List all policies for topics, and the common policies that ignore topics."""
         return [*_RIVALS, *names(for_topics=True)]
 

@@ -37,9 +37,9 @@ def export(
     A model.zip holds pickles, so reading it can run any code: export models of your own alone.
 
     Args:
-        model: Of a run of train.py: model.safetensors, or model.zip (fleet-ppo). Or the zip of your own PPO,
-            A2C, DQN or MaskablePPO with MlpPolicy among candidates. For C: a policy's name, such as afr, or a
-            .safetensors of weights. For roscpp and ros2: all, or several of these with commas between.
+        model: The model.safetensors of a run, or the zip of your own PPO, A2C, DQN or MaskablePPO with MlpPolicy
+            among candidates. For C: a policy's name, such as afr, or a .safetensors of weights. For roscpp and ros2:
+            all, or several of these with commas between.
         out: File to write; for roscpp and ros2 a folder of sources, which the robot compiles.
         to: Kind of file.
     """
