@@ -24,10 +24,10 @@ class Wire:
         self.cut = threading.Event()
         self.most_bytes = 2000
         """Larger packets are lost, and nobody is told."""
+        self.refused_s = 0.0
+        """When the first one came."""
         self.packet_s = 0.0
         """Time that a packet takes."""
-        self.connected_s = 0.0
-        """Time of the first packet of TCP."""
         self._known, self._forgotten = set[bytes](), set[bytes]()
         self._ended = threading.Event()
         self._devices = {between.near.device: between.far.device, between.far.device: between.near.device}
@@ -47,8 +47,8 @@ class Wire:
         ports = packet[head : head + 4]
         flow = min(ports, ports[2:] + ports[:2])
         self._known.add(flow)
-        is_tcp = packet[9 if head == 20 else 6] == 6
-        self.connected_s = self.connected_s or is_tcp * time.monotonic()
+        if len(packet) > self.most_bytes:
+            self.refused_s = self.refused_s or time.monotonic()
         return not self.cut.is_set() and len(packet) <= self.most_bytes and flow not in self._forgotten
 
     def _run(self) -> None:
