@@ -26,7 +26,6 @@ from bufgym_live.robot.sockets import (
     bounded_backoff,
     connections_to,
     little_unsent,
-    moved_to,
     unsent_bytes,
     until_writable,
 )
@@ -128,8 +127,8 @@ class BusChannel:
     def left_bytes(self) -> int | None:
         return None if self.socket is None else unsent_bytes(self.socket)
 
-    def moved_to(self) -> str | None:
-        return None if self.socket is None else moved_to(self.socket)
+    def tcp(self) -> socket.socket | None:
+        return self.socket
 
     def close(self) -> None:
         while not self._came.empty():

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from bufgym_live.robot.bus_channel import BusChannel
 from bufgym_live.robot.buses import BUSES
 from bufgym_live.robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
-from bufgym_live.robot.sockets import BACKOFF_S, connected, host_port, moved_to, unsent_bytes, until_writable
+from bufgym_live.robot.sockets import BACKOFF_S, connected, host_port, unsent_bytes, until_writable
 
 PIECE_BYTES: Final = 16_384
 """Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""
@@ -33,8 +33,8 @@ class Channel(Protocol):
     def left_bytes(self) -> int | None:
         """Bytes given to ``send`` that the system has not sent; None if unknown."""
 
-    def moved_to(self) -> str | None:
-        """This machine's new address, if it is another than the connection's; None if not or unknown."""
+    def tcp(self) -> socket.socket | None:
+        """Its TCP socket, to look at; None if hidden."""
 
     def close(self) -> None:
         """Close at once."""
@@ -87,8 +87,8 @@ class TcpChannel:
         unsent = unsent_bytes(self._socket)
         return None if unsent is None else self._unwritten_bytes + unsent
 
-    def moved_to(self) -> str | None:
-        return moved_to(self._socket)
+    def tcp(self) -> socket.socket:
+        return self._socket
 
     def close(self) -> None:
         self._socket.close()
@@ -157,8 +157,9 @@ class WebSocketChannel:
         waiting = self._unwritten_bytes + transport.get_write_buffer_size()
         return None if unsent is None else waiting + unsent
 
-    def moved_to(self) -> str | None:
-        return moved_to(self._connection.transport.get_extra_info("socket"))
+    def tcp(self) -> socket.socket | None:
+        tcp: socket.socket | None = self._connection.transport.get_extra_info("socket")
+        return tcp
 
     def close(self) -> None:
         self._connection.transport.abort()

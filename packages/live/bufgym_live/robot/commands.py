@@ -107,11 +107,19 @@ async def send(
                 if taker is not None:
                     taker(one)
 
+        answered = False
+
+        def tell(fault: str) -> None:
+            nonlocal answered
+            answered |= not fault
+            if fault and answered and not view:
+                say(f"{to}: {fault}")
+
         value = qoi.exponential(math.exp(-1))
         queue = PolicyQueue(policy, capacity, value=value, duration_s=duration, log=record, window=window or 1)
         leaves: Leaves = "sent" if window is None else "acked"
         loop = asyncio.get_running_loop()
-        sender = Sender(queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff), leaves)
+        sender = Sender(queue, lambda: TRANSPORTS[transport](host, port, backoff_s=backoff), leaves, tell)
         sending, began_s, body = asyncio.create_task(sender.run()), loop.time(), bytes(size)
         for k in range(round(rate * duration)):
             await asyncio.sleep(began_s + k / rate - loop.time())

@@ -6,6 +6,9 @@ again. Each message (DATA) is then answered by an ACK with its number. A sender 
 
 Latched state (LATCHED) is no message of the queue and has numbers of its own. The receiver answers it by LATCHED with
 its number and no body. The receiver's greeting also names its run, so that a sender knows one that was restarted.
+
+A sender with nothing on its way says PING each second, which TCP acks (``path_watch``); the receiver does not answer,
+because it may be busy for long with the message before.
 """
 
 import contextlib
@@ -13,8 +16,8 @@ import struct
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-GREETING, DATA, ACK, GOODBYE, LATCHED = 1, 2, 3, 4, 5
-_KINDS: Final = (GREETING, DATA, ACK, GOODBYE, LATCHED)
+GREETING, DATA, ACK, GOODBYE, LATCHED, PING = 1, 2, 3, 4, 5, 6
+_KINDS: Final = (GREETING, DATA, ACK, GOODBYE, LATCHED, PING)
 
 _HEADER: Final = struct.Struct("!2sBxIQQqdI")
 """Magic, kind, bytes of the body, number, seq, time of the put in us, x, topic."""
@@ -31,7 +34,7 @@ class FrameError(ConnectionError):
 class Frame(NamedTuple):
     """One frame."""
 
-    kind: int  # GREETING, DATA, ACK, GOODBYE or LATCHED
+    kind: int  # GREETING, DATA, ACK, GOODBYE, LATCHED or PING
     number: int
     """Index of the message among all that the socket dequeued; in a receiver's greeting the next one expected."""
     seq: int = 0

@@ -26,6 +26,7 @@ from bufgym_live.robot.frames import (
     HEADER_BYTES,
     LATCHED,
     MAX_BODY_BYTES,
+    PING,
     Frame,
     FrameError,
     Room,
@@ -172,6 +173,8 @@ class Receiver:
         while True:
             async with asyncio.timeout(IDLE_S):  # wait_for would lose a cancellation that comes with the frame
                 frame = await frames.receive()
+            if frame.kind == PING:
+                continue
             if frame.kind == GOODBYE:
                 self._streams.pop(name, None)
                 return

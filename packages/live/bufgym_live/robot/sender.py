@@ -9,8 +9,9 @@ from typing import Final, Literal
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.robot.channels import Channel
-from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, LATCHED, STREAM_BYTES, Frame, FrameError
+from bufgym_live.robot.frames import ACK, DATA, GOODBYE, GREETING, LATCHED, PING, STREAM_BYTES, Frame, FrameError
 from bufgym_live.robot.latched import Latched
+from bufgym_live.robot.path_watch import PathWatch
 from bufgym_live.robot.path_window import PathWindow
 from bufgym_live.robot.queue import Item, PolicyQueue
 from bufgym_live.robot.tasks import until_one_ends
@@ -26,7 +27,6 @@ Leaves = Literal["sent", "acked", "written"]
 
 RETRY_S: Final = 0.5
 PATIENCE_S: Final = 20.0  # Time for the receiver's answer to the greeting
-LOOK_S: Final = 0.5  # Time between two looks at this machine's address
 _MOST_UNACKED: Final = 256  # limit on messages that await the receiver's ack, where they count as left before it
 
 
@@ -56,10 +56,11 @@ class Sender:
             raise BufgymError(f"leaves = {leaves!r}: must be 'sent', 'acked' or 'written'")
         self.queue = queue
         self.connected = asyncio.Event()
-        """Set while the receiver has answered on this connection."""
+        """Set while the receiver answers."""
         self.faults: deque[str] = deque(maxlen=100)
         """Reasons of the last 100 ends of a connection."""
-        self._connect, self._leaves, self._on_status = connect, leaves, on_status
+        self._leaves, self._on_status = leaves, on_status
+        self._path = PathWatch(connect, self._on_silence, self._ping)
         self._last_status: str | None = None
         self._stream = os.urandom(STREAM_BYTES)
         self._unacked: deque[Item] = deque()
@@ -71,6 +72,7 @@ class Sender:
         self._max_body_bytes = 0
         self._next = 0  # the number of the message that the queue returns next
         self._left = 0  # messages reported to the queue as left
+        self._silenced = False  # there was an answer before the silence
         self._said_goodbye = False  # then the receiver may hang up before we know that our goodbye was sent
 
     async def run(self) -> None:
@@ -79,15 +81,21 @@ class Sender:
         Raises:
             BufgymError: a message is larger than the receiver takes.
         """
+        try:
+            await self._run()
+        finally:
+            self._path.close()
+
+    async def _run(self) -> None:
         while True:
             try:
-                channel = await asyncio.wait_for(self._connect(), PATIENCE_S)
+                channel = await asyncio.wait_for(self._path.connected(), PATIENCE_S)
             except (OSError, TimeoutError) as error:
                 self._note(error)
                 await asyncio.sleep(RETRY_S)
                 continue
             try:
-                await until_one_ends(self._talk(channel), self._stays(channel))
+                await until_one_ends(self._talk(channel), self._path.watch(channel))
                 return
             except (OSError, TimeoutError) as error:
                 self._note(error)
@@ -95,11 +103,22 @@ class Sender:
                 self.queue.left_bytes = lambda: None
                 self.connected.clear()
                 channel.close()
-            await asyncio.sleep(RETRY_S)
+            if not self._path.ready:
+                await asyncio.sleep(RETRY_S)
 
     def _note(self, error: Exception) -> None:
-        self.faults.append(f"{type(error).__name__}: {error}")
+        self.faults.append(_words(error))
         self._tell(self.faults[-1])
+
+    def _on_silence(self, silence: Exception | None) -> None:
+        """Tell that nothing is heard, or that the same connection is heard again."""
+        if silence is not None:
+            self._silenced = self.connected.is_set()
+            self.connected.clear()
+            self._tell(_words(silence))
+        elif self._silenced:
+            self.connected.set()
+            self._tell("")
 
     def _tell(self, fault: str) -> None:
         if fault != self._last_status:
@@ -113,12 +132,6 @@ class Sender:
         self._tell("")
         self.queue.left_bytes = channel.left_bytes
         await self._converse(channel)
-
-    async def _stays(self, channel: Channel) -> None:
-        """Give the connection up when this machine has a new address: what is sent to the old one does not arrive."""
-        while (new := channel.moved_to()) is None:
-            await asyncio.sleep(LOOK_S)
-        raise ConnectionAbortedError(f"this machine's address has become {new}")
 
     async def _greet(self, channel: Channel) -> None:
         """Name the stream; skip messages that the receiver already has."""
@@ -161,6 +174,10 @@ class Sender:
     async def _write(self, channel: Channel, frame: Frame) -> None:
         async with self._writing:
             await channel.send(frame)
+
+    async def _ping(self, channel: Channel) -> None:
+        if self.connected.is_set() and not self._writing.locked():
+            await self._write(channel, Frame(PING, 0))
 
     async def _send_all(self, channel: Channel, begun: asyncio.Event) -> None:
         await begun.wait()
@@ -215,3 +232,7 @@ class Sender:
         if item.number >= self._left:
             self._left = item.number + 1
             self.queue.gone()
+
+
+def _words(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

@@ -16,8 +16,9 @@ import stat
 import struct
 import sys
 from collections.abc import Callable
+from contextvars import ContextVar
 from ipaddress import ip_address
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 UNSENT_BYTES: Final = 16_384  # TCP_NOTSENT_LOWAT, the unsent bytes that may wait in the kernel
 NEXT_ADDRESS_S: Final = 1.0  # Time for one of a host's addresses to answer before the next is tried
@@ -29,6 +30,12 @@ _CONNECT_S: Final = 3.0  # Time for a new connection; TCP asks again after 1 and
 _UNBOUNDED_DEAD_AFTER_S: Final = 5.0  # DEAD_AFTER_S where the kernel cannot bound its backoff: a new connection is soon
 _TCP_RTO_MAX_MS: Final = 44  # of linux/tcp.h, from Linux 6.15 on; Python's socket lacks it
 _SIOCOUTQNSD: Final = 0x894B  # of linux/sockios.h; Python's termios lacks it
+_TCP_INFO: Final = struct.Struct("=16xI4xI24x2I60xQ")
+"""Of linux/tcp.h: bytes of a segment, segments in flight, ms since data and since an ack, bytes acked."""
+_SIOCOUTQ: Final = 0x5411
+
+PACKET_BYTES: Final[ContextVar[int | None]] = ContextVar("packet_bytes", default=None)
+"""Largest packet of a connection that is made, both ways; None: as large as the interface takes."""
 
 
 def unsent_bytes(connection: socket.socket) -> int | None:
@@ -36,14 +43,54 @@ def unsent_bytes(connection: socket.socket) -> int | None:
 
     SIOCOUTQ would count bytes in flight as well, which no decision can change.
     """
+    return _queued_bytes(connection, _SIOCOUTQNSD)
+
+
+def _queued_bytes(connection: socket.socket, request: int) -> int | None:
     if not sys.platform.startswith("linux"):
         return None
     import fcntl
 
     try:
-        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), _SIOCOUTQNSD, b"\0\0\0\0"))[0])
+        return int(struct.unpack("i", fcntl.ioctl(connection.fileno(), request, b"\0\0\0\0"))[0])
     except (OSError, ValueError):  # it is closed
         return None
+
+
+class Heard(NamedTuple):
+    """What the system has heard of a connection's other end."""
+
+    silent_s: float
+    """Time since anything came: an ack of TCP, or data."""
+    in_flight: bool
+    waiting_bytes: int
+    """Bytes not acked, sent or not."""
+    full: bool
+    """Whether as much as a full segment was acked."""
+
+
+def heard(connection: socket.socket) -> Heard | None:
+    """Ask the system; None where it does not tell, or once the connection is closed."""
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        told = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+        mss, in_flight, data_ms, ack_ms, acked_bytes = _TCP_INFO.unpack(told)
+    except (OSError, struct.error):  # it is closed, or the kernel is older than 4.1
+        return None
+    waiting_bytes = _queued_bytes(connection, _SIOCOUTQ) or 0
+    return Heard(min(data_ms, ack_ms) / 1000, in_flight > 0, waiting_bytes, acked_bytes > mss)
+
+
+def segment_bytes(connection: socket.socket, packet_bytes: int) -> int:
+    """TCP's MSS for packets of this size."""
+    return packet_bytes - (60 if connection.family == socket.AF_INET6 else 40)
+
+
+def drop_unacked(connection: socket.socket) -> None:
+    """Have the system forget at the close what was not acked; otherwise it repeats that for DEAD_AFTER_S."""
+    with contextlib.suppress(OSError):
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
 
 def little_unsent(connection: socket.socket) -> None:
@@ -173,6 +220,8 @@ async def connected(host: str, port: int, small: bool = True, backoff_s: float =
         connection = socket.socket(family, kind, protocol)
         try:
             connection.setblocking(False)
+            if (packet_bytes := PACKET_BYTES.get()) is not None:
+                set_option(connection, "TCP_MAXSEG", segment_bytes(connection, packet_bytes))
             if small:
                 little_unsent(connection)
                 bounded = bounded_backoff(connection, backoff_s)

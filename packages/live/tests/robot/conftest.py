@@ -1,4 +1,4 @@
-"""A broker of MQTT for the tests that want one, and quick reconnects for all."""
+"""A broker of MQTT and a wire between two namespaces for the tests that want one, and quick reconnects for all."""
 
 import contextlib
 import os
@@ -10,9 +10,11 @@ from collections.abc import Iterator
 
 import pytest
 from needs import needs
+from wire_cases import Wire
 
-from bufgym_live.robot import sender
+from bufgym_live.robot import sender, tunnel
 from bufgym_live.robot.sockets import free_port
+from bufgym_live.robot.tunnel import Tunnel
 
 
 @pytest.fixture(autouse=True)
@@ -37,3 +39,13 @@ def broker_port() -> Iterator[int]:
             yield port
         finally:
             broker.kill()
+
+
+@pytest.fixture
+def between() -> Iterator[tuple[Tunnel, Wire]]:
+    if reason := tunnel.impossible():
+        pytest.skip(needs("root", reason))
+    with tunnel.opened() as made:
+        wire = Wire(made)
+        yield made, wire
+        wire.close()

@@ -114,7 +114,7 @@ class Channel:
     def left_bytes(self) -> int | None:
         return None
 
-    def moved_to(self) -> str | None:
+    def tcp(self) -> None:
         return None
 
     def close(self) -> None:

@@ -1,17 +1,13 @@
 """Links that die and come back, and a robot's new address, over the kernel's own TCP between two namespaces."""
 
 import asyncio
-import contextlib
 import itertools
-import os
-import select
 import socket
 import subprocess
 import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -20,17 +16,16 @@ import pytest
 import roscpp_cases
 from needs import needs
 from ros1_cases import SYSTEM, environment
+from wire_cases import FAR, NEAR, PORT, Far, Wire, at, program, waited
 
-from bufgym_live.robot import PolicyQueue, tunnel
+from bufgym_live.robot import PolicyQueue
 from bufgym_live.robot.channels import TcpChannel
-from bufgym_live.robot.receiver import Receiver
 from bufgym_live.robot.sender import Sender
 from bufgym_live.robot.sockets import bounded_backoff
-from bufgym_live.robot.tunnel import ADDRESSES, End, Tunnel
+from bufgym_live.robot.tunnel import Tunnel
 
-NEAR, FAR = ADDRESSES
 MOVED = "10.79.0.3"
-PORT, MASTER = 7410, 11311
+MASTER = 11311
 DEAD_S, NO_LINK_S, SOON_S = 20.0, 2.0, 3.0
 CAMERA = Path(__file__).resolve().parents[4] / "examples" / "ros2" / "camera.py"
 NODE = """
@@ -51,85 +46,10 @@ rospy.spin()
 """
 
 
-class Wire:
-    """The link between both ends, which loses every packet while it is cut."""
-
-    def __init__(self, between: Tunnel) -> None:
-        self.cut = threading.Event()
-        self._ended = threading.Event()
-        self._devices = {between.near.device: between.far.device, between.far.device: between.near.device}
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._ended.is_set():
-            for device in select.select(list(self._devices), [], [], 0.05)[0]:
-                with contextlib.suppress(OSError):
-                    packet = os.read(device, 2000)
-                    if not self.cut.is_set():
-                        os.write(self._devices[device], packet)
-
-
-@pytest.fixture
-def between() -> Iterator[tuple[Tunnel, Wire]]:
-    if reason := tunnel.impossible():
-        pytest.skip(needs("root", reason))
-    with tunnel.opened() as made:
-        wire = Wire(made)
-        yield made, wire
-        wire.close()
-
-
-def at(end: End, work: Callable[[], Any]) -> threading.Thread:
-    """Run it in a thread of its own in this namespace."""
-
-    def run() -> None:
-        end.enter()
-        work()
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    return thread
-
-
-def program(end: End, *words: Any, stdout: int = subprocess.DEVNULL, **settings: str) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        list(map(str, words)), env={**os.environ, **settings}, preexec_fn=end.enter, text=True,
-        stdin=subprocess.PIPE, stdout=stdout, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-
-
-class Far:
-    """A receiver at the far end, and when messages came."""
-
-    def __init__(self, end: End) -> None:
-        self.came: list[float] = []
-        self.listens = threading.Event()
-        at(end, lambda: asyncio.run(self._receive()))
-        assert self.listens.wait(10)
-
-    async def _receive(self) -> None:
-        receiver = Receiver(lambda message: self.came.append(time.monotonic()))
-        await receiver.listen(PORT, FAR)
-        self.listens.set()
-        await asyncio.Event().wait()
-
-
 def new_address() -> None:
     """What a robot meets that comes into another network."""
     for verb, address in (("del", NEAR), ("add", MOVED)):
         subprocess.run(["ip", "addr", verb, f"{address}/24", "dev", "bufgym0"], check=True)
-
-
-def waited(holds: Callable[[], Any]) -> None:
-    ends_s = time.monotonic() + 60
-    while not holds():
-        assert time.monotonic() < ends_s
-        time.sleep(0.01)
 
 
 def test_a_robots_new_address_is_a_new_connection(between: tuple[Tunnel, Wire]) -> None:

@@ -75,8 +75,9 @@ def node(request: pytest.FixtureRequest, talker: Path) -> Path:
         (folder / name).write_text('#include "rclcpp_lifecycle_double.hpp"\n')
     flags = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-I", source, "-I", folder, "-I", HERE]
     flags += [word for package in sorted(MESSAGES.iterdir()) for word in ("-isystem", package)]
-    queue = [request.param, source / "sender.cpp", source / "connection.cpp"] if request.param else []
-    given = HERE / "ros2_node_session.cpp", source / "node.cpp", *queue, talker.parent / "libbufgym_queue.a"
+    given = [HERE / "ros2_node_session.cpp", source / "node.cpp", talker.parent / "libbufgym_queue.a"]
+    if request.param:
+        given = [request.param, *(source / f"{name}.cpp" for name in ("sender", "connection", "path")), *given]
     run("g++", *flags, *given, "-o", folder / "session", "-lpthread")
     return folder / "session"
 

@@ -214,7 +214,7 @@ async def test_no_more_peers_than_it_has_room_for(monkeypatch: pytest.MonkeyPatc
 async def test_a_receiver_that_takes_no_byte_is_asked_again() -> None:
     answers = [Frame(GREETING, 0, 0), Frame(GREETING, 0, 100)]
     channel = AsyncMock(receive=lambda: asyncio.sleep(0, answers.pop(0)) if answers else asyncio.sleep(60))
-    channel.close = channel.moved_to = lambda: None
+    channel.close = channel.tcp = lambda: None
     one = Sender(PolicyQueue("fifo", 2), AsyncMock(return_value=channel))
     running = asyncio.create_task(one.run())
     await until(one.connected.is_set)

@@ -5,12 +5,7 @@
 #include <algorithm>
 #include <cerrno>
 #include <cstring>
-#include <stdexcept>
 
-#include <fcntl.h>
-#include <netdb.h>
-#include <netinet/in.h>
-#include <netinet/tcp.h>
 #include <poll.h>
 #include <sys/eventfd.h>
 #include <sys/socket.h>
@@ -20,54 +15,11 @@ namespace bufgym
 {
 namespace
 {
-const int UNSENT_BYTES = 16384;   // the system wants more when less than this is unsent, whatever is in flight
-const size_t PIECE_BYTES = 16384; // written at a time
-const int DEAD_MS = 20000;        // a connection without acks for so long is given up
-const int SOONER_DEAD_MS = 5000;  // where the kernel cannot bound its backoff: a new connection is soon
-const int BACKOFF_MS = 1000;      // longest time between two tries of TCP at a dead link
+const size_t PIECE_BYTES = 16384;  // written at a time
+const int ANSWER_MS = 20000;       // for the answer to the greeting
 const int RETRY_MS = 500;
-const int LOOK_MS = 500;          // time between two looks at this machine's address
-const int CONNECT_MS = 3000;      // TCP asks again after 1 and 3 s
-const int NEXT_ADDRESS_MS = 1000; // before another of the host's addresses is tried
+const int LOOK_MS = 250;  // between two looks at the path
 const size_t MOST_UNACKED = 256;
-
-// Why a connection ended.
-struct Fault : std::runtime_error
-{
-  using runtime_error::runtime_error;
-};
-
-void set(int socket, int option, int number) { setsockopt(socket, IPPROTO_TCP, option, &number, sizeof number); }
-
-// Connect to the first of the host's addresses that answers.
-int connected(const Address &to)
-{
-  addrinfo hints = {}, *found = nullptr;
-  hints.ai_socktype = SOCK_STREAM;
-  if (const int error = getaddrinfo(to.host.c_str(), std::to_string(to.port).c_str(), &hints, &found))
-    throw Fault(to.host + ": " + gai_strerror(error));
-  const std::unique_ptr<addrinfo, void (*)(addrinfo *)> all(found, freeaddrinfo);
-  int error = ECONNREFUSED;
-  for (const addrinfo *one = found; one; one = one->ai_next)
-  {
-    const int made = socket(one->ai_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-    if (made < 0)
-      continue;
-    set(made, TCP_NOTSENT_LOWAT, UNSENT_BYTES);
-    set(made, TCP_NODELAY, 1);
-    if (!bounded_backoff(made, BACKOFF_MS, DEAD_MS))
-      set(made, TCP_USER_TIMEOUT, SOONER_DEAD_MS);
-    pollfd watched = {made, POLLOUT, 0};
-    socklen_t size = sizeof error;
-    error = connect(made, one->ai_addr, one->ai_addrlen) ? errno : 0;
-    if (error == EINPROGRESS && (error = ETIMEDOUT, poll(&watched, 1, one->ai_next ? NEXT_ADDRESS_MS : CONNECT_MS) > 0))
-      getsockopt(made, SOL_SOCKET, SO_ERROR, &error, &size);
-    if (!error)
-      return made;
-    ::close(made);
-  }
-  throw Fault(to.host + ":" + std::to_string(to.port) + ": " + std::strerror(error));
-}
 }
 
 void Sender::run()
@@ -81,7 +33,7 @@ void Sender::run()
     std::string fault;
     try
     {
-      const int made = connected(to);
+      const int made = path_.connected(to);
       {
         std::lock_guard<std::mutex> open(mutex_);
         socket_ = made;
@@ -100,7 +52,8 @@ void Sender::run()
     {
       faults_++;
       fault_ = fault;
-      changed_.wait_for(lock, std::chrono::milliseconds(RETRY_MS), [this] { return stopped_ || moved_; });
+      if (!path_.won())
+        changed_.wait_for(lock, std::chrono::milliseconds(RETRY_MS), [this] { return stopped_ || moved_; });
     }
   }
   changed_.notify_all();
@@ -125,12 +78,7 @@ void Sender::ready(short events)
     const int found = poll(watched, 2, LOOK_MS);
     if (found < 0 && errno != EINTR)
       throw Fault(std::strerror(errno));
-    if (found == 0)
-    {
-      const std::string address = moved_to(socket_);
-      if (!address.empty())
-        throw Fault("this machine's address has become " + address);
-    }
+    look(!events);
     if (found <= 0 && !events)
       return;
     if (found <= 0)
@@ -150,6 +98,30 @@ void Sender::ready(short events)
     if ((watched[0].revents & events) || (!events && watched[0].revents))
       return;
   }
+}
+
+// From time to time look at this machine's address and at the path; an idle one is asked for a sign of life.
+void Sender::look(bool idle)
+{
+  if (now_us() - looked_us_ < LOOK_MS * INT64_C(1000))
+    return;
+  looked_us_ = now_us();
+  const std::string address = moved_to(socket_);
+  if (!address.empty())
+  {
+    path_.moved();
+    throw Fault("this machine's address has become " + address);
+  }
+  const std::string silence = path_.look(socket_);
+  if (idle && most_bytes_ && path_.wants_ping())
+  {
+    const std::string ping = header({PING, 0, 0, 0, 0, 0.0});
+    if (::send(socket_, ping.data(), ping.size(), MSG_NOSIGNAL) != ssize_t(ping.size()))
+      throw Fault(std::strerror(errno));
+  }
+  std::lock_guard<std::mutex> lock(mutex_);
+  connected_ = most_bytes_ && silence.empty();
+  fault_ = connected_ || !silence.empty() ? silence : fault_;
 }
 
 // Write it all; number is that of the message whose body it is, or -1.
@@ -178,7 +150,7 @@ void Sender::greet()
   }
   most_bytes_ = 0;
   write(header({GREETING, uint32_t(stream_.size()), first, 0, 0, 0.0}) + stream_, -1);
-  const int64_t until_us = now_us() + DEAD_MS * INT64_C(1000);
+  const int64_t until_us = now_us() + ANSWER_MS * INT64_C(1000);
   while (most_bytes_ == 0)
   {
     ready(0);

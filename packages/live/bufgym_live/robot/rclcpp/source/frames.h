@@ -8,7 +8,7 @@
 
 namespace bufgym
 {
-enum Kind { GREETING = 1, DATA = 2, ACK = 3, GOODBYE = 4, LATCHED = 5 };
+enum Kind { GREETING = 1, DATA = 2, ACK = 3, GOODBYE = 4, LATCHED = 5, PING = 6 };
 const size_t HEADER_BYTES = 44, STREAM_BYTES = 16;
 
 struct Frame

@@ -11,6 +11,7 @@
 #include "frames.h"
 #include "latched.h"
 #include "log.h"
+#include "path.h"
 #include "policy.h"
 
 namespace bufgym
@@ -24,12 +25,6 @@ struct Numbers
   double qoi;       // information of what has left
   bool connected;
   std::string fault;  // why the last connection ended
-};
-
-struct Address
-{
-  std::string host;
-  int port = 7410;
 };
 
 class Sender
@@ -75,6 +70,7 @@ private:
   void leave(const Message &message);
   void take_acks();
   void ready(short events);
+  void look(bool idle);
   void next_in_socket(int64_t at_us);
   int64_t carried();
   int64_t stamp();
@@ -98,6 +94,8 @@ private:
 
   // Of the thread alone; socket_ is closed and opened under the mutex.
   int socket_ = -1, wake_ = -1;
+  Path path_;
+  int64_t looked_us_ = 0;
   std::string stream_, came_;
   std::deque<Message> unacked_;
   uint64_t most_bytes_ = 0;
