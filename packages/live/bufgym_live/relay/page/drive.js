@@ -4,7 +4,8 @@
 import {say} from "./draw.js";
 
 const PERIOD_MS = 100, FOR_MS = 400, TURN = 2;      // rad/s at the pad's edge for each m/s there
-const KEYS = {ArrowUp: [1, 0], w: [1, 0], ArrowDown: [-1, 0], s: [-1, 0], ArrowLeft: [0, 1], a: [0, 1], ArrowRight: [0, -1], d: [0, -1]};
+const AHEAD = [1, 0], BACK = [-1, 0], LEFT = [0, 1], RIGHT = [0, -1];
+const KEYS = {ArrowUp: AHEAD, KeyW: AHEAD, ArrowDown: BACK, KeyS: BACK, ArrowLeft: LEFT, KeyA: LEFT, ArrowRight: RIGHT, KeyD: RIGHT};  // by event.code
 const within = value => Math.min(1, Math.max(-1, value));
 
 export class Drive {
@@ -30,17 +31,6 @@ export class Drive {
     pad.onpointermove = event => { if (this.pointer) aim(event); };
     pad.onpointerup = pad.onpointercancel = pad.onlostpointercapture = () => {
       this.pointer = null;
-      this.hold();
-    };
-    pad.onkeydown = event => {
-      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-      if (!(key in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
-      event.preventDefault();
-      this.keys.add(key);
-      this.hold();
-    };
-    pad.onkeyup = event => {
-      this.keys.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key);
       this.hold();
     };
     pad.onblur = () => this.release();
@@ -70,6 +60,19 @@ export class Drive {
     this.$("drive").setAttribute("aria-pressed", isOpen);
     if (isOpen) this.pad.focus();
   }
+
+  get isOpen() { return this.robot !== null && !this.$("driving").hidden; }
+
+  // A key is down; whether it drives. One that was held before it could drive is to be pressed anew.
+  press(code, isRepeat) {
+    if (!this.isOpen || !(code in KEYS)) return false;
+    if (isRepeat) return true;
+    this.keys.add(code);
+    this.hold();
+    return true;
+  }
+
+  lift(code) { if (this.keys.delete(code)) this.hold(); }
 
   // What is held has changed.
   hold() {

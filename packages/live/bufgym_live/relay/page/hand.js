@@ -5,6 +5,7 @@ import {say, tint} from "./draw.js";
 import {Drive} from "./drive.js";
 import {FAR_M, number} from "./cdr.js";
 import {stamped, still} from "./cdr_write.js";
+import {listen} from "./keys.js";
 
 // Topics of ROS that do the same, below /robots/NAME/to/, for a robot that takes them: each with its type and what it says.
 const POSE = "geometry_msgs/msg/PoseStamped", ESTIMATE = "geometry_msgs/msg/PoseWithCovarianceStamped";
@@ -39,15 +40,8 @@ export class Hand {
     $("stop-all").onclick = () => this.stopAll();
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
-    addEventListener("keydown", event => {
-      if (event.key === "Escape") this.escape();
-      const isText = /** @type {Element} */ (event.target).matches("[type=search], [type=password], [type=number], select");
-      if (event.key.toLowerCase() === "x" && !isText && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey) $("stop").click();
-    });
-    $("policy").onchange = () => {
-      this.send("policy", {policy: $("policy").value});
-      $("policy").blur();
-    };
+    listen($, this.drive, {stop: () => $("stop").click(), escape: () => this.escape()});
+    $("policy").onchange = () => this.send("policy", {policy: $("policy").value});
   }
 
   // What is open or in hand is so no more.

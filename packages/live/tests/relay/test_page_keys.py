@@ -1,0 +1,164 @@
+"""Keys on the page: a stop and driving by the place of a key, whatever the layout prints there and whatever has the focus."""
+
+import asyncio
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from browser_cases import browsing, shows
+from loop_cases import compiled
+from needs import needs
+
+for library in ("websockets", "re2", "rosbags", "PIL"):
+    pytest.importorskip(library, reason=needs("extras", library))
+
+from page_cases import Fleet  # noqa: E402
+from relay_cases import client  # noqa: E402
+from test_page import until  # noqa: E402
+from test_page_fleet import PLACE, text  # noqa: E402
+
+pytestmark = compiled
+
+LAYOUTS = {"en": "x", "ru": "ч", "el": "χ", "he": "ס", "fr": "x"}
+"""What the key with the X of an English keyboard types."""
+CONTROLS = """[...document.querySelectorAll("button, select, input, summary, a[href], [tabindex]")].filter(one =>
+  one.checkVisibility() && !one.disabled && !one.matches("[type=search], [type=number], [type=password]"))"""
+ALL_COMMANDS = ["stop", "release", "goal", "pose", "cancel", "drive"]
+STILL = {"linear": 0, "angular": 0, "for_ms": 0}
+
+
+class Yard(Fleet):
+    """A fleet whose stops and velocities are timed as they come, and confirmed."""
+
+    def __init__(self, **changed: Any) -> None:
+        super().__init__(**changed)
+        self.stops: list[float] = []
+
+    async def run(self) -> None:
+        await asyncio.gather(super().run(), self.watch())
+
+    async def watch(self) -> None:
+        while not self.port:
+            await asyncio.sleep(0.01)
+        async with client(self.port, **{**self.hello, "name": "watch"}) as one:
+            await one.subscribe("^/robots/[^/]+/stop$")
+            while not self.over.is_set():
+                try:
+                    said = await asyncio.wait_for(one.socket.recv(), 0.5)
+                except TimeoutError:
+                    continue
+                if isinstance(said, bytes):
+                    self.stops.append(time.monotonic())
+                    id = json.loads(said[said.index(b"{") :])["id"]
+                    for status, _ in self.robots.values():
+                        status["answer"] = {"id": id, "why": ""}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with browsing() as one:
+        yield one
+
+
+def press(devtools: Any, code: str, key: str, *kinds: str, **fields: Any) -> None:
+    """A trusted key, as a keyboard of some layout sends it."""
+    virtual = ord(code[-1]) if code.startswith("Key") else 0
+    for kind in kinds or ("keyDown", "keyUp"):
+        typed = {"text": key} if kind == "keyDown" and len(key) == 1 and not fields.get("modifiers") else {}
+        said = {"type": kind, "code": code, "key": key, "windowsVirtualKeyCode": virtual, **typed, **fields}
+        devtools.send("Input.dispatchKeyEvent", said)
+
+
+def came(page: Any, seen: list[Any], count: int) -> bool:
+    """Whether so many have come, within 5 s."""
+    for _ in range(1_000):
+        if len(seen) >= count:
+            return True
+        page.wait_for_timeout(5)
+    return False
+
+
+def parked(fleet: Fleet, page: Any, **status: Any) -> None:
+    """A robot that takes all commands is chosen."""
+    fleet.robots["one"] = {"location": PLACE, "commands": ALL_COMMANDS, "policies": ["afr", "xerox"], **status}, ()
+    until(page, f"{text('#stop')} === 'Stop one'", "!document.querySelector('#drive').hidden")
+
+
+def test_x_stops_on_each_layout_and_from_each_control(browser: Any) -> None:
+    """A select with an entry that begins with an x keeps its choice; a text field takes the letter."""
+    took: dict[str, list[float]] = {layout: [] for layout in LAYOUTS}
+    names: set[str] = set()
+    with Yard() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/") as page:
+        parked(fleet, page)
+        devtools = page.context.new_cdp_session(page)
+        for tab in ("overview", "cameras", "3d", "health"):
+            page.evaluate(f"location.hash = '#/robot/one/{tab}'")
+            until(page, f"document.body.dataset.tab === '{tab}'")
+            shown = "document.querySelector('#player').hidden = document.querySelector('#driving').hidden = false;"
+            page.evaluate(shown + "document.querySelector('#layers-box').open = true;")
+            page.wait_for_timeout(300)
+            for k in range(page.evaluate(f"{CONTROLS}.length")):
+                for layout, key in LAYOUTS.items():
+                    if tab != "overview" and layout not in ("ru", "fr"):
+                        continue
+                    was = page.evaluate(f"(window.one = {CONTROLS}[{k}]).focus(), one.value")
+                    who = page.evaluate("one.id || one.dataset.tab || one.className || one.tagName")
+                    names.add(who)
+                    before, began_s = len(fleet.stops), time.monotonic()
+                    press(devtools, "KeyX", key)
+                    assert came(page, fleet.stops, before + 1), f"{tab}, {who}, {layout}"
+                    took[layout].append(fleet.stops[before] - began_s)
+                    assert page.evaluate("one.value") == was
+        print({layout: f"{1e3 * max(each):.0f} ms at most of {len(each)}" for layout, each in took.items()})
+        assert {"policy", "speed", "speed-most", "when", "stop", "map", "pad", "recordings", "shade", "home"} <= names
+        assert max(map(max, took.values())) < 1.0
+        for modified in ({"modifiers": 2}, {"modifiers": 1}, {"modifiers": 4}):
+            press(devtools, "KeyX", "x", **modified)
+        before = len(fleet.stops)
+        page.focus("#search")
+        press(devtools, "KeyX", "x")
+        until(page, "document.querySelector('#search').value === 'x'")
+        page.fill("#search", "")
+        page.focus("#map")
+        press(devtools, "KeyX", "X", modifiers=8)
+        assert came(page, fleet.stops, before + 1)
+        page.wait_for_timeout(200)
+        assert len(fleet.stops) == before + 1
+
+
+@pytest.mark.parametrize("key", ["z", "ц"])
+def test_the_place_of_w_drives_and_no_control_takes_it(browser: Any, key: str) -> None:
+    """Driving is open: an arrow on the select of the speed drives, and a modified key does nothing."""
+    with Yard() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/") as page:
+        parked(fleet, page)
+        devtools = page.context.new_cdp_session(page)
+        page.click("#drive")
+        page.select_option("#speed-most", "0.5")
+        assert page.evaluate("document.activeElement.id") == "pad"
+        for focus, code, what, ahead in (
+            ("pad", "KeyW", key, 0.5),
+            ("speed-most", "ArrowDown", "ArrowDown", -0.5),
+            ("policy", "KeyS", "ы", -0.5),
+            ("fit", "ArrowUp", "ArrowUp", 0.5),
+        ):
+            page.focus(f"#{focus}")
+            was = page.evaluate("document.activeElement.value")
+            press(devtools, code, what, "keyDown")
+            for _ in range(400):
+                if fleet.driven and fleet.driven[-1]["linear"] == ahead:
+                    break
+                page.wait_for_timeout(20)
+            else:
+                pytest.fail(f"{focus}, {code}: {fleet.driven[-3:]}")
+            press(devtools, code, what, "keyUp")
+            page.wait_for_timeout(400)
+            assert fleet.driven[-1] == STILL
+            assert page.evaluate("document.activeElement.value") == was
+        fleet.driven.clear()
+        press(devtools, "KeyW", key, modifiers=2)
+        page.focus("#map")
+        press(devtools, "ArrowUp", "ArrowUp")
+        page.wait_for_timeout(300)
+        assert fleet.driven == []
