@@ -1,6 +1,7 @@
 """Keys on the page: a stop and driving by the place of a key, whatever the layout prints there and whatever has the focus."""
 
 import asyncio
+import contextlib
 import json
 import time
 from collections.abc import Iterator
@@ -18,6 +19,10 @@ from page_cases import Fleet  # noqa: E402
 from relay_cases import client  # noqa: E402
 from test_page import until  # noqa: E402
 from test_page_fleet import PLACE, text  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
+
+from bufgym_live.relay.config import Limits  # noqa: E402
+from bufgym_live.relay.wire import Message  # noqa: E402
 
 pytestmark = compiled
 
@@ -44,14 +49,10 @@ class Yard(Fleet):
             await asyncio.sleep(0.01)
         async with client(self.port, **{**self.hello, "name": "watch"}) as one:
             await one.subscribe("^/robots/[^/]+/stop$")
-            while not self.over.is_set():
-                try:
-                    said = await asyncio.wait_for(one.socket.recv(), 0.5)
-                except TimeoutError:
-                    continue
-                if isinstance(said, bytes):
+            with contextlib.suppress(ConnectionClosed):  # the relay has ended
+                while isinstance(said := await one.next(), Message):
                     self.stops.append(time.monotonic())
-                    id = json.loads(said[said.index(b"{") :])["id"]
+                    id = json.loads(bytes(said.payload))["id"]
                     for status, _ in self.robots.values():
                         status["answer"] = {"id": id, "why": ""}
 
@@ -83,14 +84,21 @@ def came(page: Any, seen: list[Any], count: int) -> bool:
 def parked(fleet: Fleet, page: Any, **status: Any) -> None:
     """A robot that takes all commands is chosen."""
     fleet.robots["one"] = {"location": PLACE, "commands": ALL_COMMANDS, "policies": ["afr", "xerox"], **status}, ()
-    until(page, f"{text('#stop')} === 'Stop one'", "!document.querySelector('#drive').hidden")
+    fleet.robots["one"][0]["queue"] = {"capacity": 8, "policy": "afr"}
+    until(
+        page,
+        f"{text('#stop')} === 'Stop one'",
+        "!document.querySelector('#drive').hidden",
+        "!document.querySelector('#policy').disabled",
+    )
 
 
 def test_x_stops_on_each_layout_and_from_each_control(browser: Any) -> None:
     """A select with an entry that begins with an x keeps its choice; a text field takes the letter."""
     took: dict[str, list[float]] = {layout: [] for layout in LAYOUTS}
     names: set[str] = set()
-    with Yard() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/") as page:
+    often = Limits(hello_s=60, messages_per_s=10**5)
+    with Yard(limits=often) as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/") as page:
         parked(fleet, page)
         devtools = page.context.new_cdp_session(page)
         for tab in ("overview", "cameras", "3d", "health"):
@@ -114,6 +122,16 @@ def test_x_stops_on_each_layout_and_from_each_control(browser: Any) -> None:
         print({layout: f"{1e3 * max(each):.0f} ms at most of {len(each)}" for layout, each in took.items()})
         assert {"policy", "speed", "speed-most", "when", "stop", "map", "pad", "recordings", "shade", "home"} <= names
         assert max(map(max, took.values())) < 1.0
+        page.evaluate("location.hash = '#/robot/one/overview'")
+        until(page, "document.body.dataset.tab === 'overview'")
+        for select in ("speed-most", "speed", "policy"):  # and over its open list
+            before = len(fleet.stops)
+            page.focus(f"#{select}")
+            page.keyboard.press("Space")
+            until(page, f"document.querySelector('#{select}').matches(':open')")
+            press(devtools, "KeyX", "ч")
+            assert came(page, fleet.stops, before + 1), select
+            page.keyboard.press("Escape")
         for modified in ({"modifiers": 2}, {"modifiers": 1}, {"modifiers": 4}):
             press(devtools, "KeyX", "x", **modified)
         before = len(fleet.stops)

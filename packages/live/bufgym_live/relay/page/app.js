@@ -89,11 +89,19 @@ const relay = new Relay({
     hand.offerPolicies();
     hand.draw();
   },
+  rights() {
+    hand.offerPolicies();
+    hand.draw();
+  },
+  slept(ms) {
+    hand.drive.release();
+    notices.told("sleep", `This computer slept for ${seconds(ms / 1000)}: connecting anew`, relay.clock.now());
+  },
   message(message) { tried(live, message); },
   said(said) {
     if (said.op === "recordings") player.list(said.files);
     else if (said.op === "replayed") player.replay?.take(said);
-    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, relay.clock.now());
+    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, relay.clock.now(), null, `${said.what} ${said.code} ${said.topic}`);
   },
   unauthorized(why, token) { signIn.refused(why, token); },
 });

@@ -16,6 +16,7 @@ export class Drive {
     this.keys = new Set();
     this.pointer = null;                            // [ahead, left] of the pad's middle, from -1 to 1
     this.timer = 0;
+    this.isHeard = true;                            // whether the last velocity went
     const pad = this.pad = $("pad");
     $("drive").onclick = () => this.open($("driving").hidden);
     const aim = event => {
@@ -51,7 +52,7 @@ export class Drive {
     const stop = robot?.status?.stop;
     if (stop) this.release();
     const driver = robot?.status?.driver ?? "";
-    say(this.$("driver"), stop ? `stopped by ${stop.by}: release it first` : driver && driver !== this.relay.name ? "somebody else drives it" : "hold, or arrows");
+    say(this.$("driver"), stop ? `stopped by ${stop.by}: release it first` : driver && driver !== this.relay.name ? "somebody else drives it" : !this.isHeard ? "the link does not keep up: nothing is sent" : "hold, or arrows");
   }
 
   open(isOpen) {
@@ -90,12 +91,13 @@ export class Drive {
       sum[1] += left;
     }
     const most = Number(this.$("speed-most").value), [ahead, left] = sum.map(within);
-    this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false, FOR_MS);
+    this.isHeard = this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false, FOR_MS);
   }
 
   release() {
     this.keys.clear();
     this.pointer = null;
+    this.isHeard = true;
     if (!this.timer) return;
     clearInterval(this.timer);
     this.timer = 0;

@@ -56,10 +56,10 @@ export class Hand {
   // How the robot takes a command of a kind: its topic, and a type if that is ROS's own; undefined if it does not, or the viewer may not.
   way(robot, kind) {
     const {commands = [], receives = []} = robot.status ?? {}, own = `/robots/${robot.name}/${kind === "drive" ? "drive" : "command"}`, asked = kind === "policy" ? robot.status?.policies.length : commands.includes(kind);
-    if (asked && this.relay.mayCommand(own) && !(kind === "drive" && this.relay.holds(own))) return {topic: own};   // what is held comes late
+    if (asked && this.relay.mayCommand(own, kind === "stop") && !(kind === "drive" && this.relay.holds(own))) return {topic: own};   // what is held comes late
     for (const [name, type] of Object.entries(TOPICS[kind] ?? {})) {
       const topic = `/robots/${robot.name}/to/${name}`;
-      if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic)) return {topic, type};
+      if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic, kind === "stop")) return {topic, type};
     }
   }
 

@@ -2,7 +2,7 @@
 // letter a layout has there, and no select, slider or button takes them.
 
 const TEXT = "textarea, input:not([type=checkbox], [type=radio], [type=range], [type=button], [type=submit], [type=reset], [type=color], [type=file])";
-const ARROWED = "#map, #space, #list, dialog";      // arrows have a use of their own there
+const ARROWED = "#map, #space, #list, dialog, option";  // arrows have a use of their own there
 
 const isText = target => target instanceof HTMLElement && (target.matches(TEXT) || target.isContentEditable);
 
