@@ -94,7 +94,7 @@ const relay = new Relay({
     hand.draw();
   },
   slept(ms) {
-    hand.drive.release();
+    hand.drive.open(false);
     notices.told("sleep", `This computer slept for ${seconds(ms / 1000)}: connecting anew`, relay.clock.now());
   },
   message(message) { tried(live, message); },

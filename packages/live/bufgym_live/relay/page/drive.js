@@ -15,6 +15,7 @@ export class Drive {
     this.robot = null;                              // who may be driven
     this.keys = new Set();
     this.pointer = null;                            // [ahead, left] of the pad's middle, from -1 to 1
+    this.stick = null;                              // the same, of a gamepad
     this.timer = 0;
     this.isHeard = true;                            // whether the last velocity went
     const pad = this.pad = $("pad");
@@ -75,9 +76,16 @@ export class Drive {
 
   lift(code) { if (this.keys.delete(code)) this.hold(); }
 
+  // A gamepad's stick, or null where none drives any more.
+  tilt(stick) {
+    if (!stick && !this.stick) return;
+    this.stick = stick;
+    this.hold();
+  }
+
   // What is held has changed.
   hold() {
-    if (!this.pointer && !this.keys.size) return this.release();
+    if (!this.pointer && !this.stick && !this.keys.size) return this.release();
     if (!this.robot || this.timer) return;
     if (this.robot.status?.stop) return;
     this.timer = setInterval(() => this.send(), PERIOD_MS);
@@ -86,7 +94,7 @@ export class Drive {
 
   send() {
     const sum = [0, 0];
-    for (const [ahead, left] of this.pointer ? [this.pointer] : [...this.keys].map(key => KEYS[key])) {
+    for (const [ahead, left] of this.pointer ? [this.pointer] : this.stick ? [this.stick] : [...this.keys].map(key => KEYS[key])) {
       sum[0] += ahead;
       sum[1] += left;
     }
@@ -96,7 +104,7 @@ export class Drive {
 
   release() {
     this.keys.clear();
-    this.pointer = null;
+    this.pointer = this.stick = null;
     this.isHeard = true;
     if (!this.timer) return;
     clearInterval(this.timer);

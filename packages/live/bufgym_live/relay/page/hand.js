@@ -5,6 +5,7 @@ import {say, tint} from "./draw.js";
 import {Drive} from "./drive.js";
 import {FAR_M, number} from "./cdr.js";
 import {stamped, still} from "./cdr_write.js";
+import {Gamepads} from "./gamepad.js";
 import {listen} from "./keys.js";
 
 // Topics of ROS that do the same, below /robots/NAME/to/, for a robot that takes them: each with its type and what it says.
@@ -40,6 +41,7 @@ export class Hand {
     $("stop-all").onclick = () => this.stopAll();
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
+    new Gamepads(this.drive, () => $("stop").click());
     listen($, this.drive, {stop: () => $("stop").click(), escape: () => this.escape()});
     $("policy").onchange = () => this.send("policy", {policy: $("policy").value});
   }

@@ -20,7 +20,7 @@ export class Sleep {
   slept() {
     const {wallMs, ms, wasHidden, everyMs} = this;
     this.look();
-    const byDate = this.wallMs - wallMs, byClock = this.ms - ms, isLate = !wasHidden && Math.min(byDate, byClock) > everyMs + LATE_MS;
-    return byDate - byClock > STOOD_MS || isLate ? byDate - everyMs : 0;
+    const byDate = this.wallMs - wallMs, byClock = this.ms - ms, stood = byDate - byClock, isLate = !wasHidden && Math.min(byDate, byClock) > everyMs + LATE_MS;
+    return stood > STOOD_MS ? stood : isLate ? byDate - everyMs : 0;
   }
 }
