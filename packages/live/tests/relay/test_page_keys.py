@@ -308,6 +308,29 @@ def test_a_rule_that_takes_exponential_time_here_takes_none(browser: Any) -> Non
         assert came(page, fleet.stops, 1)
 
 
+@pytest.mark.parametrize("width", [1360, 390])
+def test_tools_cover_no_robot(browser: Any, width: int) -> None:
+    """Each robot of six at the map's edges is seen and chosen by a click, while driving is open."""
+    with Yard() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/", width=width) as page:
+        for k in range(6):
+            at = {**PLACE, "x": 4.0 * (k % 3), "y": 6.0 * (k // 3)}
+            fleet.robots[f"r{k}"] = {"location": at, "commands": ALL_COMMANDS}, ()
+        until(page, f"{text('.called')}.includes('r5')", "!document.querySelector('#drive').hidden")
+        spy = "import('./map.js').then(({Map2D}) => { const {draw} = Map2D.prototype;"
+        page.evaluate(
+            f"{spy} Map2D.prototype.draw = function (...all) {{ window.plan = this; draw.apply(this, all); }}; }})"
+        )
+        page.click("#drive")
+        until(page, "window.plan?.robots?.length === 6")
+        page.wait_for_timeout(5_000)  # the map comes to rest
+        page.evaluate("document.querySelector('#map').scrollIntoView({block: 'center'})")
+        covered = """plan.robots.filter(({pose}) => {
+          const {left, top} = plan.canvas.getBoundingClientRect(), [x, y] = plan.at(pose.x, pose.y);
+          return document.elementFromPoint(left + x, top + y) !== plan.canvas;
+        }).map(robot => robot.name).join()"""
+        assert page.evaluate(covered) == ""
+
+
 def test_late_velocities_are_one_alert(browser: Any) -> None:
     with Yard() as fleet, shows(browser, f"http://127.0.0.1:{fleet.port}/") as page:
         parked(fleet, page)
