@@ -149,7 +149,7 @@ function subscribe() {
 function tried(those, message) {
   try {
     if (message.topic === "/relay/status") sayRelay(json(message));
-    else those.take(message, relay.isLatched(message.topic));
+    else those.take(message, relay.isLatched(message.topic) ?? true);
   } catch {
     return;
   }

@@ -7,7 +7,7 @@ import {Sleep} from "./sleep.js";
 
 const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 2000, HELD_MS = 5000;  // as in backoff.py, but somebody waits for it
 const ASK_MS = 500, SILENT_MS = 2000, LOST_MS = 6000;  // the relay is asked so often; without an answer for so long it is not live, then given up
-const COMMAND_S = 3;
+const COMMAND_S = 3, EARLY = 1000;
 
 export class Relay {
   // on: {state(text, isOn), welcome(), rights(), message(message), said(object), unauthorized(why, token), slept(ms)}
@@ -16,6 +16,7 @@ export class Relay {
     this.welcome = null;
     this.clock = new Clock();
     this.rights = new Rights(this);
+    this.early = [];                                // messages on topics of which the relay has not said yet what they are
     this.sleep = new Sleep(ASK_MS);
     this.waits = 0;                                 // timer of the next try
     this.askedMs = null;                            // since when an answer is awaited
@@ -193,8 +194,8 @@ export class Relay {
   // ``unknown`` is the answer until the relay has said.
   mayCommand(topic, unknown = false) { return this.rights.of(topic).send ?? unknown; }
 
-  // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old. So it may until the relay has said.
-  isLatched(topic) { return this.rights.of(topic).latched ?? true; }
+  // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old. Undefined until the relay has said.
+  isLatched(topic) { return this.rights.of(topic).latched; }
 
   hear(data) {
     if (typeof data !== "string") return this.take(decode(data));
@@ -204,6 +205,7 @@ export class Relay {
       this.welcome = said;
       this.since = performance.now();
       this.rights.begin();
+      this.early = [];
       this.clock.begin(said.clock_us / 1000);
       this.askedMs = null;
       this.isLive = true;
@@ -219,6 +221,7 @@ export class Relay {
     } else if (said.op === "ack") this.answered(said.seq);
     else if (said.op === "rights") {
       this.rights.heard(said.rights);
+      for (const message of this.early.splice(0)) this.pass(message);
       this.on.rights();
     } else if (said.op === "refused") this.refuse(said);
     else this.on.said(said);
@@ -251,6 +254,12 @@ export class Relay {
       this.received = message.seq;
       this.say("ack", {seq: message.seq});
     }
-    this.on.message(message);
+    this.pass(message);
+  }
+
+  // Pass it on, once it is known whether it may be old; that a robot was stopped or removed waits for nothing.
+  pass(message) {
+    if (/\/(stop|last)$/.test(message.topic) || this.isLatched(message.topic) !== undefined || this.early.length >= EARLY) this.on.message(message);
+    else this.early.push(message);
   }
 }
