@@ -123,6 +123,7 @@ def test_x_stops_on_each_layout_and_from_each_control(browser: Any) -> None:
                     assert came(page, fleet.stops, before + 1), f"{tab}, {who}, {layout}"
                     took[layout].append(fleet.stops[before] - began_s)
                     assert page.evaluate("one.value") == was
+        assert len(fleet.stops) == sum(map(len, took.values()))  # one for each press
         print({layout: f"{1e3 * max(each):.0f} ms at most of {len(each)}" for layout, each in took.items()})
         assert {"policy", "speed", "speed-most", "when", "stop", "map", "pad", "recordings", "shade", "home"} <= names
         assert max(map(max, took.values())) < 1.0
