@@ -183,11 +183,15 @@ class Hub:
         """Whether the topic is lossless."""
         return _any_whole(self.config.no_drop, topic)
 
+    def is_latched(self, topic: str) -> bool:
+        """Whether the topic's last message is kept by the configuration."""
+        return _any_whole(self.config.latched, topic)
+
     def publish(self, sender: Member | None, message: wire.Message) -> None:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         outgoing = Outgoing(message)
-        if is_last(message.topic) or is_stop(message.topic) or _any_whole(self.config.latched, message.topic):
+        if is_last(message.topic) or is_stop(message.topic) or self.is_latched(message.topic):
             self._latch(outgoing)
         for member, subscription in self._route(message.topic):
             if member is not sender:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 MAX_PRIORITY: Final = 1e6
 MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
-ORDERS: Final = ("subscribe", "unsubscribe", "publish", "ack", "clock", "recordings", "replay")
+ORDERS: Final = ("subscribe", "unsubscribe", "may", "publish", "ack", "clock", "recordings", "replay")
 _TOLD: Final = ("send", "receive", "topic", "command_s")  # of a rule, to its client
 _DIGITS: Final = bytes.maketrans(b"123456789E", b"000000000e")
 _LARGE: Final = (b"e000", b"e+000", 200 * b"0")  # parts of numbers that may not be finite, with all digits made zeros
