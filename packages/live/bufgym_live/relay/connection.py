@@ -33,6 +33,7 @@ Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
 _MOST_IN_TURN: Final = 8  # frames of a client that are taken without a turn of all others
 _MOST_ORDERS: Final = 64  # orders of a client that wait for the disk; beyond, nothing more of it is read
+_RIGHT_BYTES: Final = 100  # bytes of JSON that a topic counts for whose rights are asked
 BUSY_S: Final = 1.0  # Time to a refusal because too much waits for the disk, so that clients do not try at once
 
 
@@ -132,6 +133,9 @@ class Connection:
                 case {"op": "ack", "seq": number} as said:
                     self._outbox.acked(number)
                     self._hub.store.acked(self.session, number, said.get("why", "")[: protocol.MOST_WHY])
+                case {"op": "may", "topics": topics}:
+                    await self._caller.pace(_RIGHT_BYTES * len(topics))
+                    self.tell("rights", rights={topic: self._right(topic) for topic in topics})
                 case {"op": "clock"}:
                     self.tell("clock", clock_us=self._hub.now_us())
                 case {"op": "recordings"}:
@@ -139,6 +143,14 @@ class Connection:
                     self.tell("recordings", files=await asyncio.to_thread(replay.recordings, folder))
                 case said:
                     await self._replay(said)
+
+    def _right(self, topic: str) -> dict[str, Any]:
+        """What the client may do on a topic, so that it need match no rule itself."""
+        if not wire.is_name(topic):
+            return {"send": False}
+        send = not topic.startswith(f"/{wire.OWN}/") and self.permissions.allow("send", topic)
+        kinds = {"no_drop": self._hub.is_no_drop(topic), "latched": self._hub.is_latched(topic)}
+        return {"send": send, "command_s": self.permissions.command_s(topic), **kinds}
 
     async def _later(self, work: Work, message: wire.Message | None = None) -> None:
         """Have this done after all else that waits for the disk, while the client is read on."""

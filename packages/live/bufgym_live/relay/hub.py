@@ -154,13 +154,17 @@ class Hub:
         """Whether the topic is lossless."""
         return _any_whole(self.config.no_drop, topic)
 
+    def is_latched(self, topic: str) -> bool:
+        """Whether the topic's last message is kept by the configuration."""
+        return _any_whole(self.config.latched, topic)
+
     def publish(self, sender: Member | None, message: wire.Message) -> None:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         outgoing = Outgoing(message)
         if is_last(message.topic) and message.payload == GONE:
             self._last.forget(message.topic)
-        elif is_last(message.topic) or _any_whole(self.config.latched, message.topic):
+        elif is_last(message.topic) or self.is_latched(message.topic):
             self._last.keep(outgoing, "" if sender is None else sender.session.identity.key)
         robot = status_of(message.topic)
         # Only the robot itself knows its stops, and the relay where it is.

@@ -30,8 +30,7 @@ from bufgym_live.relay.wanted import OnMessage, Wanted
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
-MOST_WHY: Final = 300  # Characters of why a command was not executed
-MOST_WHYS: Final = 64  # of which a new connection tells
+MOST_WHYS: Final = 64  # Refused commands of which a new connection tells
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
 _FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting fixes
 
@@ -89,10 +88,8 @@ class Session:
         self._stops = Stops(self.deadlines.dated, self._session)
         self._inbox = Inbox()
         self._wanted = asyncio.Event()
-        self._received = [0, 0]
-        """Number of the last no_drop message received from home and from the relay that stands in."""
-        self._whys: dict[int, str] = {}
-        """Number of a no_drop message from home -> why it was not executed; the last ones."""
+        self._received = [0, 0]  # number of the last no_drop message from home and from the relay that stands in
+        self._whys: dict[str, str] = {}  # number of a no_drop message from home -> why it was not executed
         self._subscriptions = Wanted()
         self._connection: Any = None
         self._tasks = Tasks()
@@ -249,9 +246,8 @@ class Session:
             self._received[1] = 0
         else:
             hello |= {"session": self._session, "received": self._received[0], "acked": self._unanswered.acked}
-            hello |= {"robot": self.robot} if self.robot else {}
-            hello |= {"open": self._unanswered.open} if self._unanswered.open else {}
-            hello |= {"whys": {str(seq): why for seq, why in self._whys.items()}} if self._whys else {}
+            more = {"robot": self.robot, "open": self._unanswered.open, "whys": self._whys}
+            hello |= {name: value for name, value in more.items() if value}
         self.deadlines.begin()
         await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
@@ -328,9 +324,8 @@ class Session:
         if message.no_drop:
             self._received[self.stands_in] = message.seq
             if why and not self.stands_in:
-                self._whys[message.seq] = why[:MOST_WHY]
-                for old in list(self._whys)[:-MOST_WHYS]:
-                    del self._whys[old]
+                self._whys[str(message.seq)] = why[:300]
+                self._whys = dict(list(self._whys.items())[-MOST_WHYS:])
             # After the program has had it: if the connection breaks before, the relay sends it again.
             await self._say_it("ack", seq=message.seq, **({"why": why} if why else {}))
 

@@ -159,8 +159,13 @@ def check_topic(topic: str) -> None:
 
 def check_name(what: str, name: str) -> None:
     """A name is short, and prints as it stands: so it is UTF-8."""
-    if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES:
+    if not is_name(name):
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
+
+
+def is_name(name: str) -> bool:
+    """Whether it may be a name."""
+    return name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES
 
 
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQ)]
@@ -201,6 +206,8 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     },
     "subscribed": {"id": str},
     "unsubscribe": {"id": str},
+    "may": {"topics": list[str]},
+    "rights": {"rights": dict[str, Any]},
     "publish": {**_MESSAGE, "data": msgspec.Raw},
     "message": {**_MESSAGE, "sender": str, "at_us?": Number, "number?": Number, "seen?": str},
     "ack": {"seq": Number, "why?": str},

@@ -67,7 +67,7 @@ def test_a_hello_that_is_refused() -> None:
 def test_who_is_let_in_and_welcomed() -> None:
     said = protocol.hello(wire.say("hello", version=1, session="a", received=3, acked=2))
     admitted = protocol.admit(said, ANNA, RULES, "fresh")
-    assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2, "", ())
+    assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2, "", (), {})
     assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == (
         "n",
         "fresh",

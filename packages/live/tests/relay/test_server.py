@@ -110,6 +110,21 @@ async def test_each_refusal_says_why() -> None:
         await wait("the end of a connection beyond the limit", one.socket.wait_closed())
 
 
+async def test_a_client_asks_what_it_may_do_on_topics() -> None:
+    """As for messages, the rule that matches first says for how long; what can be no topic is denied."""
+    hard = Rule(address="127.0.0.0/8", send=True, topic="/robots/([a-z0-9]+-?)+/(command|drive)", command_s=5)
+    topics = ["/robots/r-1/command", f"/robots/{'a' * 31}!/drive", "/robots/r-1/map", "/relay/status", "a" * 300, "/\0"]
+    async with relay(settings(rules=(hard,))) as server, client(server.port, name="ann") as ann:
+        await ann.say("may", topics=topics)
+        said = await ann.next()
+        whole = {"send": True, "command_s": 5.0, "no_drop": True, "latched": False}
+        assert said["op"] == "rights" and list(said["rights"]) == topics
+        assert said["rights"][topics[0]] == whole and said["rights"][topics[2]]["latched"]
+        assert [said["rights"][topic]["send"] for topic in topics] == [True, *[False] * 5]
+        await ann.say("may", topics=[1])
+        assert (await ann.next())["code"] == "wrong"
+
+
 async def test_sixty_robots_come_from_one_address() -> None:
     """By the default limits, each with ten topics of ten messages at once, and two subscriptions; more are refused."""
 

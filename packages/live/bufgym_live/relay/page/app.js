@@ -89,11 +89,19 @@ const relay = new Relay({
     hand.offerPolicies();
     hand.draw();
   },
+  rights() {
+    hand.offerPolicies();
+    hand.draw();
+  },
+  slept(ms) {
+    hand.drive.open(false);
+    notices.told("sleep", `This computer slept for ${seconds(ms / 1000)}: connecting anew`, relay.clock.now());
+  },
   message(message) { tried(live, message); },
   said(said) {
     if (said.op === "recordings") player.list(said.files);
     else if (said.op === "replayed") player.replay?.take(said);
-    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, relay.clock.now());
+    else if (said.op === "refused") notices.refused(split(String(said.topic ?? "")).name ?? chosen ?? "", `${said.what}: ${said.why}`, relay.clock.now(), null, `${said.what} ${said.code} ${said.topic}`);
   },
   unauthorized(why, token) { signIn.refused(why, token); },
 });
@@ -141,7 +149,7 @@ function subscribe() {
 function tried(those, message) {
   try {
     if (message.topic === "/relay/status") sayRelay(json(message));
-    else those.take(message, relay.isLatched(message.topic));
+    else those.take(message, relay.isLatched(message.topic) ?? true);
   } catch {
     return;
   }

@@ -7,6 +7,7 @@ export class Clock {
   constructor() {
     this.aheadMs = null;
     this.setMs = 0;
+    this.stampsAheadMs = -Infinity;
   }
 
   // Another connection: the relay may be another.
@@ -20,6 +21,12 @@ export class Clock {
     const ms = performance.now(), ahead = relayMs - ms;
     this.aheadMs = this.aheadMs === null ? ahead : Math.max(ahead, this.aheadMs - DRIFT * (ms - this.setMs));
     this.setMs = ms;
+  }
+
+  // For stamps, from which a robot counts: they never go back, not with another connection, and after a sleep they are right again.
+  stamp() {
+    this.stampsAheadMs = Math.max(this.stampsAheadMs, this.aheadMs ?? 0);
+    return performance.now() + this.stampsAheadMs;
   }
 
   now() { return performance.now() + (this.aheadMs ?? 0); }

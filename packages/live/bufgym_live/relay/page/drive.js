@@ -4,7 +4,8 @@
 import {say} from "./draw.js";
 
 const PERIOD_MS = 100, FOR_MS = 400, TURN = 2;      // rad/s at the pad's edge for each m/s there
-const KEYS = {ArrowUp: [1, 0], w: [1, 0], ArrowDown: [-1, 0], s: [-1, 0], ArrowLeft: [0, 1], a: [0, 1], ArrowRight: [0, -1], d: [0, -1]};
+const AHEAD = [1, 0], BACK = [-1, 0], LEFT = [0, 1], RIGHT = [0, -1];
+const KEYS = {ArrowUp: AHEAD, KeyW: AHEAD, ArrowDown: BACK, KeyS: BACK, ArrowLeft: LEFT, KeyA: LEFT, ArrowRight: RIGHT, KeyD: RIGHT};  // by event.code
 const within = value => Math.min(1, Math.max(-1, value));
 
 export class Drive {
@@ -14,7 +15,9 @@ export class Drive {
     this.robot = null;                              // who may be driven
     this.keys = new Set();
     this.pointer = null;                            // [ahead, left] of the pad's middle, from -1 to 1
+    this.stick = null;                              // the same, of a gamepad
     this.timer = 0;
+    this.isHeard = true;                            // whether the last velocity went
     const pad = this.pad = $("pad");
     $("drive").onclick = () => this.open($("driving").hidden);
     const aim = event => {
@@ -30,17 +33,6 @@ export class Drive {
     pad.onpointermove = event => { if (this.pointer) aim(event); };
     pad.onpointerup = pad.onpointercancel = pad.onlostpointercapture = () => {
       this.pointer = null;
-      this.hold();
-    };
-    pad.onkeydown = event => {
-      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-      if (!(key in KEYS) || event.ctrlKey || event.metaKey || event.altKey) return;
-      event.preventDefault();
-      this.keys.add(key);
-      this.hold();
-    };
-    pad.onkeyup = event => {
-      this.keys.delete(event.key.length === 1 ? event.key.toLowerCase() : event.key);
       this.hold();
     };
     pad.onblur = () => this.release();
@@ -61,7 +53,7 @@ export class Drive {
     const stop = robot?.status?.stop;
     if (stop) this.release();
     const driver = robot?.status?.driver ?? "";
-    say(this.$("driver"), stop ? `stopped by ${stop.by}: release it first` : driver && driver !== this.relay.name ? "somebody else drives it" : "hold, or arrows");
+    say(this.$("driver"), stop ? `stopped by ${stop.by}: release it first` : driver && driver !== this.relay.name ? "somebody else drives it" : !this.isHeard ? "the link does not keep up: nothing is sent" : "hold, or arrows");
   }
 
   open(isOpen) {
@@ -71,9 +63,29 @@ export class Drive {
     if (isOpen) this.pad.focus();
   }
 
+  get isOpen() { return this.robot !== null && !this.$("driving").hidden; }
+
+  // A key is down; whether it drives. One that was held before it could drive is to be pressed anew.
+  press(code, isRepeat) {
+    if (!this.isOpen || !(code in KEYS)) return false;
+    if (isRepeat) return true;
+    this.keys.add(code);
+    this.hold();
+    return true;
+  }
+
+  lift(code) { if (this.keys.delete(code)) this.hold(); }
+
+  // A gamepad's stick, or null where none drives any more.
+  tilt(stick) {
+    if (!stick && !this.stick) return;
+    this.stick = stick;
+    this.hold();
+  }
+
   // What is held has changed.
   hold() {
-    if (!this.pointer && !this.keys.size) return this.release();
+    if (!this.pointer && !this.stick && !this.keys.size) return this.release();
     if (!this.robot || this.timer) return;
     if (this.robot.status?.stop) return;
     this.timer = setInterval(() => this.send(), PERIOD_MS);
@@ -82,17 +94,18 @@ export class Drive {
 
   send() {
     const sum = [0, 0];
-    for (const [ahead, left] of this.pointer ? [this.pointer] : [...this.keys].map(key => KEYS[key])) {
+    for (const [ahead, left] of this.pointer ? [this.pointer] : this.stick ? [this.stick] : [...this.keys].map(key => KEYS[key])) {
       sum[0] += ahead;
       sum[1] += left;
     }
     const most = Number(this.$("speed-most").value), [ahead, left] = sum.map(within);
-    this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false, FOR_MS);
+    this.isHeard = this.relay.sayNow(this.topic, {linear: most * ahead, angular: most * TURN * left, for_ms: FOR_MS}, false, FOR_MS);
   }
 
   release() {
     this.keys.clear();
-    this.pointer = null;
+    this.pointer = this.stick = null;
+    this.isHeard = true;
     if (!this.timer) return;
     clearInterval(this.timer);
     this.timer = 0;

@@ -5,6 +5,8 @@ import {say, tint} from "./draw.js";
 import {Drive} from "./drive.js";
 import {FAR_M, number} from "./cdr.js";
 import {stamped, still} from "./cdr_write.js";
+import {Gamepads} from "./gamepad.js";
+import {listen} from "./keys.js";
 
 // Topics of ROS that do the same, below /robots/NAME/to/, for a robot that takes them: each with its type and what it says.
 const POSE = "geometry_msgs/msg/PoseStamped", ESTIMATE = "geometry_msgs/msg/PoseWithCovarianceStamped";
@@ -39,15 +41,9 @@ export class Hand {
     $("stop-all").onclick = () => this.stopAll();
     $("cancel").onclick = () => this.send("cancel");
     for (const kind of ["goal", "pose"]) $(kind).onclick = () => this.take(map.tool?.kind === kind ? null : kind);
-    addEventListener("keydown", event => {
-      if (event.key === "Escape") this.escape();
-      const isText = /** @type {Element} */ (event.target).matches("[type=search], [type=password], [type=number], select");
-      if (event.key.toLowerCase() === "x" && !isText && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey) $("stop").click();
-    });
-    $("policy").onchange = () => {
-      this.send("policy", {policy: $("policy").value});
-      $("policy").blur();
-    };
+    new Gamepads(this.drive, () => $("stop").click());
+    listen($, this.drive, {stop: () => $("stop").click(), escape: () => this.escape()});
+    $("policy").onchange = () => this.send("policy", {policy: $("policy").value});
   }
 
   // What is open or in hand is so no more.
@@ -62,10 +58,10 @@ export class Hand {
   // How the robot takes a command of a kind: its topic, and a type if that is ROS's own; undefined if it does not, or the viewer may not.
   way(robot, kind) {
     const {commands = [], receives = []} = robot.status ?? {}, own = `/robots/${robot.name}/${kind === "drive" ? "drive" : "command"}`, asked = kind === "policy" ? robot.status?.policies.length : commands.includes(kind);
-    if (asked && this.relay.mayCommand(own) && !(kind === "drive" && this.relay.holds(own))) return {topic: own};   // what is held comes late
+    if (asked && this.relay.mayCommand(own, kind === "stop") && !(kind === "drive" && this.relay.holds(own))) return {topic: own};   // what is held comes late
     for (const [name, type] of Object.entries(TOPICS[kind] ?? {})) {
       const topic = `/robots/${robot.name}/to/${name}`;
-      if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic)) return {topic, type};
+      if (receives.some(one => one.replace(/^\//, "") === name) && this.relay.mayCommand(topic, kind === "stop")) return {topic, type};
     }
   }
 

@@ -113,11 +113,20 @@ export class Map2D {
       [left, right] = [Math.min(left, x), Math.max(right, x)];
       [low, high] = [Math.min(low, y), Math.max(high, y)];
     }
-    const margin = 0.8, scale = Math.min(this.canvas.clientWidth / (right - left + 2 * margin), this.canvas.clientHeight / (high - low + 2 * margin));
-    const wanted = {x: (left + right) / 2, y: (low + high) / 2, scale: Math.min(120, scale)};
+    const margin = 0.8, [aside, edge] = this.covered(), {clientWidth, clientHeight} = this.canvas;
+    const scale = Math.min(120, (clientWidth - aside) / (right - left + 2 * margin), Math.max(80, clientHeight - 2 * edge) / (high - low + 2 * margin));
+    const wanted = {x: (left + right) / 2 - aside / 2 / scale, y: (low + high) / 2, scale};
     const ease = this.fitted ? 0.5 : 1;
     for (const key of ["x", "y", "scale"]) this.view[key] += (wanted[key] - this.view[key]) * ease;
     this.fitted = true;
+  }
+
+  // How much of the map tools cover: from the left, and at most at the top or the bottom; pixels.
+  covered() {
+    const place = this.canvas.parentElement, its = this.canvas.getBoundingClientRect();
+    const rects = names => [...place.querySelectorAll(names)].map(one => one.getBoundingClientRect()).filter(one => one.width);
+    const edges = [...rects("#layers-box summary, #frame, #no-map").map(one => one.bottom - its.top), ...rects("#tools, #fit").map(one => its.bottom - one.top)];
+    return [Math.max(0, ...rects("#driving").map(one => one.right - its.left)), Math.max(0, ...edges)];
   }
 
   // ``chosen`` is the robot whose layers are drawn, in ``frame``; it may be undefined.

@@ -5,6 +5,7 @@ import {address} from "./route.js";
 
 const MOST = 200;                                   // beyond it refusals and what is over go, the least first; a trouble that lasts never goes
 const CALM_MS = 2000;                               // a screen reader is told of new alerts so often at most
+const SAME_MS = 10_000;                             // refusals of a kind within so long are one, with their number
 const REFUSED = 1.5;                                // the rank of a refusal: behind a robot that is silent, before a low battery
 const isNarrow = matchMedia("(max-width: 44rem), (max-height: 30rem)");
 
@@ -34,7 +35,13 @@ export class Notices {
   }
 
   // ``again`` does once more what was refused, if somebody wants that.
-  refused(name, text, nowMs, again = null) { this.put(`refused ${name} ${text}`, {name, text, level: "refused", rank: REFUSED, overMs: null, ms: nowMs, again}); }
+  refused(name, text, nowMs, again = null, kind = text) {
+    const key = `refused ${name} ${kind}`, before = this.notices.get(key), times = before && nowMs - before.ms < SAME_MS ? before.times + 1 : 1;
+    this.put(key, {name, text, level: "refused", rank: REFUSED, overMs: null, ms: nowMs, again, times});
+  }
+
+  // What befell the page itself; a later one of a kind replaces it.
+  told(kind, text, nowMs) { this.put(`told ${kind}`, {name: "", text, level: "told", rank: REFUSED, overMs: null, ms: nowMs}); }
 
   put(key, notice) {
     if (this.notices.get(key)?.overMs !== null) this.begun.add(key);
@@ -62,7 +69,7 @@ export class Notices {
 
   // Say which have begun since it was said last: each once, however its text changes.
   speak(all) {
-    const fresh = all.filter(([key, {overMs}]) => this.begun.has(key) && overMs === null).map(([, {name, text, level}]) => `${name}: ${level === "refused" ? "refused: " : ""}${text}`);
+    const fresh = all.filter(([key, {overMs}]) => this.begun.has(key) && overMs === null).map(([, {name, text, level}]) => `${name && `${name}: `}${level === "refused" ? "refused: " : ""}${text}`);
     if (!fresh.length || performance.now() - this.spokenMs < CALM_MS) return;
     this.begun.clear();
     this.spokenMs = performance.now();
@@ -72,20 +79,20 @@ export class Notices {
   draw(nowMs) {
     this.drawnMs = nowMs;
     const all = this.sorted();
-    for (const [key, {level, overMs}] of all.slice(MOST)) if (level === "refused" || overMs !== null) this.notices.delete(key);
+    for (const [key, {level, overMs}] of all.slice(MOST)) if (level !== "error" || overMs !== null) this.notices.delete(key);
     this.speak(all);
     const shown = all.slice(0, isNarrow.matches ? 1 : 3), more = all.length - shown.length;
     this.element.hidden = all.length === 0;
     while (this.element.children.length > shown.length + 1) this.element.lastChild.remove();
     while (this.element.children.length < shown.length + 1) this.element.append(this.line());
     const last = this.element.children[shown.length];
-    shown.forEach(([key, {name, text, ms, overMs, level, again}], k) => {
+    shown.forEach(([key, {name, text, ms, overMs, level, again, times}], k) => {
       const line = this.element.children[k], [link, says, button, once] = line.children;
       line.hidden = false;
       line.className = overMs === null ? level : "over";
       if (link.hash !== address(name, "health")) link.href = address(name, "health");
       say(link, name);
-      say(says, level === "refused" ? `refused: ${text}` : `${text}, ${overMs === null ? `for ${seconds((nowMs - ms) / 1000)}` : `over, lasted ${seconds((overMs - ms) / 1000)}`}`);
+      say(says, level === "told" ? text : level === "refused" ? `refused: ${text}${times > 1 ? ` (${times} times)` : ""}` : `${text}, ${overMs === null ? `for ${seconds((nowMs - ms) / 1000)}` : `over, lasted ${seconds((overMs - ms) / 1000)}`}`);
       say(button, "Seen");
       button.onclick = () => this.dismiss(key);
       once.hidden = !again;

@@ -2,27 +2,23 @@
 
 import {Clock} from "./clock.js";
 import {decode, fromJson} from "./messages.js";
+import {Rights} from "./rights.js";
+import {Sleep} from "./sleep.js";
 
-const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 8000, HELD_MS = 5000;  // as in backoff.py
+const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 2000, HELD_MS = 5000;  // as in backoff.py, but somebody waits for it
 const ASK_MS = 500, SILENT_MS = 2000, LOST_MS = 6000;  // the relay is asked so often; without an answer for so long it is not live, then given up
-const COMMAND_S = 3;
-
-// Whether a whole topic matches; true for a pattern that only the relay's engine knows: the relay will say.
-function matches(pattern, topic) {
-  try {
-    return new RegExp(`^(?:${pattern})$`).test(topic);
-  } catch {
-    return true;
-  }
-}
+const COMMAND_S = 3, EARLY = 1000;
 
 export class Relay {
-  // on: {state(text, isOn), welcome(), message(message), said(object), unauthorized(why, token)}
+  // on: {state(text, isOn), welcome(), rights(), message(message), said(object), unauthorized(why, token), slept(ms)}
   constructor(on) {
     this.on = on;
     this.welcome = null;
     this.clock = new Clock();
-    this.rules = [];                                // of the last welcome
+    this.rights = new Rights(this);
+    this.early = [];                                // messages on topics of which the relay has not said yet what they are
+    this.sleep = new Sleep(ASK_MS);
+    this.waits = 0;                                 // timer of the next try
     this.askedMs = null;                            // since when an answer is awaited
     this.isLive = false;
     this.stops = new Map();                         // robot -> id of a stop that it has not confirmed
@@ -41,9 +37,14 @@ export class Relay {
     this.mostMs = FIRST_MS;                         // the longest delay until the next try
     this.connect();
     setInterval(() => this.watch(), ASK_MS);
+    addEventListener("online", () => this.socket.readyState === WebSocket.CONNECTING ? this.anew() : this.again());
+    document.addEventListener("visibilitychange", () => { if (!document.hidden) this.again(); });
   }
 
   connect() {
+    clearTimeout(this.waits);
+    this.waits = 0;
+    this.beganMs = performance.now();
     const address = new URL("relay", location.href);
     address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
     address.hash = address.search = "";
@@ -68,20 +69,38 @@ export class Relay {
       this.isLive = false;
       for (const {failed} of this.commands.splice(0)) failed(new Error("not confirmed before the link broke"));
       this.on.state("not connected", false);
-      if (!this.refused) setTimeout(() => this.connect(), Math.min(this.mostMs, isAway ? AWAY_MS : MOST_MS) * Math.random());
+      if (!this.refused) this.waits = setTimeout(() => this.connect(), Math.min(this.mostMs, isAway ? AWAY_MS : MOST_MS) * Math.random());
       this.mostMs = Math.min(2 * this.mostMs, MOST_MS);
     };
   }
 
+  // Try now, if it waits for the next try.
+  again() { if (this.waits) this.connect(); }
+
+  // Give this connection up, whose own end may come a minute later, and connect at once.
+  anew() {
+    this.giveUp();
+    this.again();
+  }
+
+  giveUp() {
+    const {socket} = this;
+    socket.close();
+    socket.onclose(null);
+  }
+
   // Ask the relay for its time: its answers say that the link is alive, both ways.
   watch() {
+    const slept = this.sleep.slept();
+    if (slept) {                                    // the clock is wrong, and the relay may have given this connection up
+      this.on.slept(slept);
+      return this.anew();
+    }
     const ms = performance.now(), silentMs = this.welcome && this.askedMs !== null ? ms - this.askedMs : 0;
-    if (!this.welcome) return;
-    if (silentMs > LOST_MS) {
-      const {socket} = this;
-      socket.close();
-      socket.onclose(null);                         // its own end may come a minute later
-    } else if (silentMs > SILENT_MS) {
+    if (!this.welcome) {
+      if (!this.isClosed && ms - this.beganMs > LOST_MS) this.giveUp();
+    } else if (silentMs > LOST_MS) this.giveUp();
+    else if (silentMs > SILENT_MS) {
       if (this.isLive) this.on.state("no answer", this.isLive = false);
     } else if (this.askedMs === null) {
       this.askedMs = ms;
@@ -116,19 +135,22 @@ export class Relay {
     if (this.subscriptions.delete(id) && this.welcome) this.say("unsubscribe", {id});
   }
 
-  holds(topic) { return (this.welcome?.no_drop ?? []).some(pattern => matches(pattern, topic)); }
+  holds(topic) { return this.rights.of(topic).no_drop ?? topic.endsWith("/command"); }
 
-  // Say what is worth nothing later: not while the relay is away, and behind what still waits only if it must.
+  // Say what is worth nothing later: not while the relay is away. What must not go goes only where what was said before has left and the relay
+  // answers in time. Whether it went.
   sayNow(topic, data, must, forMs) {
-    if (this.isLive && (must || this.socket.bufferedAmount === 0))
-      this.say("publish", {topic, data, encoding: "json", stamp_us: Math.round(1000 * (performance.timeOrigin + performance.now())), until_us: this.until(forMs)});
+    const keepsUp = this.socket.bufferedAmount === 0 && (this.askedMs === null || performance.now() - this.askedMs < 2 * forMs);
+    if (!this.isLive || !(must || keepsUp)) return false;
+    this.say("publish", {topic, data, encoding: "json", stamp_us: Math.round(1000 * this.clock.stamp()), until_us: this.until(forMs)});
+    return true;
   }
 
   // The relay's time in so many ms.
   until(ms) { return Math.floor(1000 * (this.clock.now() + ms)); }
 
   // The deadline of a command on a topic, by the relay's rule.
-  deadline(topic) { return this.until(1000 * (this.rules.find(rule => rule.send && matches(rule.topic, topic))?.command_s ?? COMMAND_S)); }
+  deadline(topic) { return this.until(1000 * (this.rights.of(topic).command_s ?? COMMAND_S)); }
 
   // Stop a robot, said on each connection until the robot confirms it. What waits for it is withdrawn.
   stop(robot) {
@@ -169,10 +191,11 @@ export class Relay {
     if (command) this.say("publish", {topic: command.topic, data: command.data, ...command.fields, no_drop: true, seq: this.acked + 1});
   }
 
-  mayCommand(topic) { return this.rules.some(rule => rule.send && matches(rule.topic, topic)); }
+  // ``unknown`` is the answer until the relay has said.
+  mayCommand(topic, unknown = false) { return this.rights.of(topic).send ?? unknown; }
 
-  // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old.
-  isLatched(topic) { return (this.welcome?.latched ?? []).some(pattern => matches(pattern, topic)); }
+  // Whether the relay keeps a topic's last message for who subscribes later: what comes may be old. Undefined until the relay has said.
+  isLatched(topic) { return this.rights.of(topic).latched; }
 
   hear(data) {
     if (typeof data !== "string") return this.take(decode(data));
@@ -181,7 +204,8 @@ export class Relay {
     else if (said.op === "welcome") {
       this.welcome = said;
       this.since = performance.now();
-      this.rules = said.rules;
+      this.rights.begin();
+      this.early = [];
       this.clock.begin(said.clock_us / 1000);
       this.askedMs = null;
       this.isLive = true;
@@ -195,7 +219,11 @@ export class Relay {
       this.askedMs = null;
       if (!this.isLive) this.on.state("live", this.isLive = true);
     } else if (said.op === "ack") this.answered(said.seq);
-    else if (said.op === "refused") this.refuse(said);
+    else if (said.op === "rights") {
+      this.rights.heard(said.rights);
+      for (const message of this.early.splice(0)) this.pass(message);
+      this.on.rights();
+    } else if (said.op === "refused") this.refuse(said);
     else this.on.said(said);
   }
 
@@ -207,6 +235,7 @@ export class Relay {
   }
 
   refuse(said) {
+    if (said.code === "unauthorized") this.rights.begin();  // the rules may have changed
     if (said.what === "hello" && said.code === "unauthorized") {
       this.refused = true;
       this.on.unauthorized(said.why, this.shown);
@@ -225,6 +254,12 @@ export class Relay {
       this.received = message.seq;
       this.say("ack", {seq: message.seq});
     }
-    this.on.message(message);
+    this.pass(message);
+  }
+
+  // Pass it on, once it is known whether it may be old; that a robot was stopped or removed waits for nothing.
+  pass(message) {
+    if (/\/(stop|last)$/.test(message.topic) || this.isLatched(message.topic) !== undefined || this.early.length >= EARLY) this.on.message(message);
+    else this.early.push(message);
   }
 }
