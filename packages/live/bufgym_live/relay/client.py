@@ -13,6 +13,7 @@ messages still on their way are sent again under their original numbers.
 """
 
 import asyncio
+import contextlib
 import ssl
 import time
 from collections import Counter, deque
@@ -142,6 +143,12 @@ class RobotClient(Session):
             except BufgymError:
                 if queue is self.queue:  # else the policy was changed in that moment
                     raise
+
+    async def ping(self) -> None:
+        """Measure ``round_trip_s``, unless the connection ends before the answer."""
+        with contextlib.suppress(Exception):  # as in ``run``, which notes it
+            if self._connection is not None:
+                self.round_trip_s = await (await self._connection.ping())
 
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         return [*super()._works(), self._send_all(), self._leave_all()]

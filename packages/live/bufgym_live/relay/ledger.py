@@ -129,15 +129,16 @@ class Ledger:
         return self.take([Stop(who, number, by, at_us)])
 
     def release(self, ids: Iterable[str], by: str, at_us: int) -> list[Stop]:
-        """Release these stops; return what is new here, and nothing if all are released already.
+        """Release these stops, also those that have not come yet; return what is new here.
 
         Raises BufgymError: none of them holds, but another does, which whoever releases these has not seen.
         """
-        names = dict(named(id) for id in ids)
-        named_here = [stop for stop in self.held if stop.number <= names.get(stop.who, -1)]
-        if self.held and not named_here:
+        names = dict(named(id) for id in ids if len(id) <= MOST_CHARACTERS + 17)
+        here = [stop for stop in self.held if stop.number <= names.get(stop.who, -1)]
+        if self.held and not here:
             raise BufgymError(f"was stopped again, by {self.by}: release that")
-        return self.take([stop._replace(released_by=by, released_us=max(1, at_us)) for stop in named_here])
+        coming = [Stop(who, number) for who, number in names.items() if not self.knows(who, number)]
+        return self.take(stop._replace(released_by=by, released_us=max(1, at_us)) for stop in (*here, *coming))
 
     @property
     def seen(self) -> str:

@@ -15,6 +15,7 @@ import msgspec
 from bufgym.model.checks import whole
 from bufgym_live.relay import wire
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Config, Rule
+from bufgym_live.relay.orders import is_stop
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.roster import GONE, is_last
@@ -85,8 +86,7 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     if robot and "session" not in said:
         raise WireError("hello: robot: needs a session of a name")
     return Admitted(
-        permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers, robot, open
-    )
+        permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers, robot, open, whys)
 
 
 def welcome(config: Config, admitted: Admitted, identity: Identity, received: int, clock_us: int) -> dict[str, Any]:
@@ -136,7 +136,8 @@ def check(
     quota.message(len(message.payload), now_s)
     if topic.startswith(f"/{wire.OWN}/") or not permissions.allow("send", topic):
         raise RefusedError("unauthorized", f"topic {topic}: no rule allows to send there")
-    quota.topic(topic, session.name)
+    if not is_stop(topic):  # whatever else its sender says
+        quota.topic(topic, session.name)
     if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
     check_json(message)

@@ -291,12 +291,6 @@ class Session:
             self._wanted.clear()
             await self._wanted.wait()
 
-    async def ping(self) -> None:
-        """Measure ``round_trip_s``, unless the connection ends before the answer."""
-        with contextlib.suppress(Exception):  # as in ``run``, which notes it
-            if self._connection is not None:
-                self.round_trip_s = await (await self._connection.ping())
-
     async def _hear_all(self) -> None:
         async for frame in self._connection:
             if isinstance(frame, bytes):
