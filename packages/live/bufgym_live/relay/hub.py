@@ -229,11 +229,11 @@ class Hub:
         """
         receivers = self._holders(sender, message.topic)
         if not receivers and not shared:
-            if robot := robot_of(message.topic):
-                raise RefusedError("no_receiver", f"robot {robot} is not here")
             alone = self.peers is not None and self.peers.state != CONNECTED
             other = ", and the other relays are out of reach" if alone else ""
-            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
+            robot = robot_of(message.topic)
+            why = f"robot {robot} is not here" if robot else f"topic {message.topic}: nobody receives it"
+            raise RefusedError("no_receiver", why + other)
         if robot_of(message.topic) and not receivers and self.peers is not None:
             self.peers.awaits(sender.session, message)
         frame = wire.encode(message)

@@ -86,7 +86,8 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     if robot and "session" not in said:
         raise WireError("hello: robot: needs a session of a name")
     return Admitted(
-        permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers, robot, open, whys)
+        permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers, robot, open, whys
+    )
 
 
 def welcome(config: Config, admitted: Admitted, identity: Identity, received: int, clock_us: int) -> dict[str, Any]:

@@ -201,6 +201,7 @@ class Store:
             if any(session.held for session in self.sessions.values()):
                 self.disk.soon(0, self._held.expire, now_us, NOT_REACHED)
         for session in list(self.sessions.values()):
+            self.acked(session, session.acked)  # what could not be written before
             if session.unused_s < self._clock() - self.limits.keep_s:
                 self._expire(session)
 

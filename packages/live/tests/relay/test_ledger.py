@@ -56,7 +56,9 @@ def test_who_and_number() -> None:
 
 
 @given(ledgers, ledgers, ledgers)
-def test_whoever_meets_agrees_in_any_order_and_however_often(one: list[Stop], two: list[Stop], three: list[Stop]) -> None:
+def test_whoever_meets_agrees_in_any_order_and_however_often(
+    one: list[Stop], two: list[Stop], three: list[Stop]
+) -> None:
     found = set()
     for order in itertools.permutations((one, two, three)):
         ledger = Ledger()
@@ -113,7 +115,9 @@ def forgets_releases(ledger: Ledger, said: list[Stop]) -> list[Stop]:
 
 
 @pytest.mark.parametrize("wrong", [lower_wins, forgets_releases])
-def test_the_model_finds_what_a_wrong_ledger_does(wrong: Callable[..., list[Stop]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_model_finds_what_a_wrong_ledger_does(
+    wrong: Callable[..., list[Stop]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Ledger, "take", lambda ledger, said: wrong(ledger, list(said)))
     assert ledger_model.explored(6)[1]
 

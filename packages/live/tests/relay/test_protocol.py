@@ -68,16 +68,8 @@ def test_who_is_let_in_and_welcomed() -> None:
     said = protocol.hello(wire.say("hello", version=1, session="a", received=3, acked=2))
     admitted = protocol.admit(said, ANNA, RULES, "fresh")
     assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2, "", (), {})
-    assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == (
-        "n",
-        "fresh",
-        True,
-        "json",
-        0,
-        0,
-        "",
-        (),
-    )
+    plain = protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")
+    assert plain[1:] == ("n", "fresh", True, "json", 0, 0, "", (), {})
     welcome = protocol.welcome(CONFIG, admitted, ANNA, 5, 7)
     assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
     assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*", "command_s": 3.0}]

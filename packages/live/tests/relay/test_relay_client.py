@@ -197,7 +197,7 @@ async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> Non
         await viewer.subscribe("camera")
         async with within("both relays"), beside(robot.run()):
             async with relay(ours), client(ours.port, session="receiver") as receiver:
-                await receiver.subscribe("/robots/other/command", durable=True)
+                await receiver.subscribe("^/robots/other/command$", durable=True)
                 await until("home", lambda: robot.ready.is_set() and not robot.stands_in)
             await until("the other", lambda: robot.ready.is_set() and robot.stands_in)
             robot.publish(camera, b"picture", "raw")

@@ -182,7 +182,7 @@ async def test_a_state_that_is_no_json_stops_no_robot(corner: Corner, monkeypatc
 @compiled
 async def test_a_robot_pings_once_at_a_time(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
     """No ping is answered while ten states come. One that ends with its connection ends no robot."""
-    asked = list[str]()
+    asked, real = list[str](), robot.RobotClient.ping
 
     async def ping(client: Session) -> None:
         asked.append(client.name)
@@ -193,7 +193,7 @@ async def test_a_robot_pings_once_at_a_time(corner: Corner, monkeypatch: pytest.
 
     async def story(viewer: Session, came: Came) -> None:
         viewer._connection = SimpleNamespace(ping=broken, transport=viewer._connection.transport)
-        await viewer.ping()
+        await real(viewer)  # type: ignore[arg-type]
         assert viewer.round_trip_s is None
         await until("ten", lambda: len(came["status"]) >= 10)
 

@@ -152,7 +152,8 @@ export class Hand {
   answered(robot) {
     const {answer: {id, why}, stops} = robot.status, {sent} = this;
     this.relay.stops.heard(robot.name, stops, true);
-    if (this.all?.open.has(robot) && Stops.has(stops, this.all.open.get(robot))) this.all.open.delete(robot);
+    const one = this.all?.open.get(robot);
+    if (one !== undefined && (id === one || Stops.has(stops, one))) this.all?.open.delete(robot);
     if (!sent || sent.doneMs || sent.robot !== robot || !this.isDone(robot)) return;
     if (why && id === sent.id) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
     sent.state = why && id === sent.id ? "refused" : "done";
