@@ -113,9 +113,8 @@ class Held:
         """Forget a session and its messages; return whether that could be written."""
         with self.bearable():
             if session.id is not None:
-                gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
-                gone += ("DELETE FROM outcome WHERE session = ?",)
-                self._settle(session, 0, 2**62, 1, *gone)
+                gone = (f"DELETE FROM {table} WHERE session = ?" for table in ("durable", "outcome"))
+                self._settle(session, 0, 2**62, 1, "DELETE FROM session WHERE id = ?", *gone)
                 del self._by_id[session.id]
                 session.id = None
         return session.id is None

@@ -31,19 +31,8 @@ def unicode_name() -> str:
             return name
 
 
-NAMES = [
-    *(f"amr{letter}1" for letter in ASCII),
-    "amr.1",
-    "amr-1",
-    "amrx1",
-    "a|b",
-    "amr(2)",
-    "amr[3]",
-    "c+",
-    "c++",
-    "amr$4",
-]
-NAMES = list(dict.fromkeys([*NAMES, *(unicode_name() for _ in range(200))]))
+ODD = ["amr.1", "amr-1", "amrx1", "a|b", "amr(2)", "amr[3]", "c+", "c++", "amr$4"]
+NAMES = list(dict.fromkeys([*(f"amr{letter}1" for letter in ASCII), *ODD, *(unicode_name() for _ in range(200))]))
 
 
 @pytest.fixture(autouse=True)
