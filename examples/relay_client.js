@@ -5,7 +5,7 @@
 
 const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 8000, HELD_MS = 5000, FOR_GOOD = ["unauthorized", "wrong"];
 const [url, name, topic, data] = process.argv.slice(2);
-const who = {version: 1, form: "json", name, session: crypto.randomUUID()};
+const who = {version: 1, form: "json", name, robot: name, session: crypto.randomUUID()};
 const commands = topic ? [{topic, data: JSON.parse(data)}] : [];  // the first is on its way
 let live = null, mostMs = FIRST_MS;                 // the WebSocket once it is welcome; longest delay until the next try
 let acked = 0, received = 0;                        // highest number of ours that the relay holds, and that came
@@ -43,6 +43,7 @@ const hear = {
     console.log("held", JSON.stringify(commands.shift()));
     next();
   },
+  delivered({seq, why}) { console.log("done", seq, why ?? ""); },
   message({topic, data, no_drop, seq}) {
     if (no_drop && seq <= received) return;
     console.log(topic, JSON.stringify(data));

@@ -21,6 +21,7 @@ from bufgym_live.relay.wire import RefusedError
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"
+TOLD: Final = "bufgym.relay.told"  # Subject of what relays say to each other: their stops, and how commands ended
 NAME: Final = "bufgym.relay.name"  # Subject under which a relay answers for its name
 STREAM: Final = "bufgym-relay"
 ANSWER_S: Final = 3.0  # Time for the server to answer
@@ -79,10 +80,13 @@ class Bus:
         self.most = most
         """Messages of other relays that are taken at a time, 0 for all."""
 
-    async def open(self, given: dict[str, Any], heard: Callable[[Any], bool], known: set[str]) -> None:
+    async def open(
+        self, given: dict[str, Any], heard: Callable[[Any], bool], told: Callable[[bytes], None], known: set[str]
+    ) -> None:
         """Connect, and take this relay's place in the stream; other ``known`` relays keep theirs.
 
-        ``heard`` is called with each message of another relay, and says whether it is late.
+        ``heard`` is called with each message of another relay, and says whether it is late; ``told`` with what another
+        relay says of itself.
 
         Raises BufgymError: NATS does not let this relay in, or another relay has its name. Any other error may pass.
         """
@@ -95,6 +99,11 @@ class Bus:
             # The place before all else: NATS forgets a no_drop message that no place waits for.
             self._heard = heard
             self._messages = await self._subscribe()
+
+            async def take(said: Any) -> None:
+                told(said.data)
+
+            await self._client.subscribe(TOLD, cb=take)
             await self._client.flush(ANSWER_S)  # from here on the server sends what others publish
         self._open = True
 
@@ -201,6 +210,10 @@ class Bus:
         while self._ahead and (self._ahead_bytes > AHEAD_BYTES or self._ahead[0][0].done()):
             await self._ahead[0][0]
             self._ahead_bytes -= self._ahead.popleft()[1]
+
+    async def tell(self, said: bytes) -> None:
+        """Say something to all other relays."""
+        await self._client.publish(TOLD, said)
 
     def _check_size(self, topic: str, frame: bytes) -> None:
         most = self._client.max_payload - _HEADER_BYTES

@@ -4,7 +4,7 @@
     client.subscribe("^/robots/robot-3/command$", on_command, durable=True)
     running = asyncio.create_task(client.run())  # connects, and again whenever the connection breaks
     client.publish("/robots/robot-3/camera", jpeg, encoding="jpeg")  # never blocks; the policy decides what goes
-    await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the relay holds it
+    await client.command("/robots/robot-4/command", {"command": "stop"})  # returns once the robot has done it
 
 Little waits outside the queue: the next message is chosen when the system has sent nearly all of the last one,
 whatever is still in flight. With ``window`` at most so many messages are on their way, as at Robofleet's client (Sec.
@@ -13,6 +13,7 @@ messages still on their way are sent again under their original numbers.
 """
 
 import asyncio
+import contextlib
 import ssl
 import time
 from collections import Counter, deque
@@ -28,7 +29,7 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.log import Record
 from bufgym_live.robot.queue import Item, PolicyQueue
-from bufgym_live.robot.sockets import until_writable
+from bufgym_live.robot.sockets import unsent_bytes, until_writable
 
 
 @dataclass(eq=False)
@@ -61,6 +62,7 @@ class RobotClient(Session):
         capacity: int = 32,
         window: int | None = None,
         value: Value | None = None,
+        robot: str = "",
         token: str | Callable[[], str | None] | None = None,
         tls: ssl.SSLContext | None = None,
         log: Callable[[int, Record], None] | None = None,
@@ -74,9 +76,9 @@ class RobotClient(Session):
             window: n_T, messages sent and not yet answered by the relay, at most; None: as many as fill the link.
             value: V of topics that have none of their own.
             log: called with the number of the queue, which ``change`` counts, and each record of its events.
-            url, name, token, tls, say: as for ``Session``.
+            url, name, robot, token, tls, say: as for ``Session``.
         """
-        super().__init__(url, name, token=token, tls=tls, say=say)
+        super().__init__(url, name, robot=robot, token=token, tls=tls, say=say)
         self._topics = tuple(topics)
         self._numbers = {topic.name: k for k, topic in enumerate(topics)}
         self._capacity, self._window, self._value, self._log = capacity, window, value, log
@@ -142,8 +144,20 @@ class RobotClient(Session):
                 if queue is self.queue:  # else the policy was changed in that moment
                     raise
 
+    async def ping(self) -> None:
+        """Measure ``round_trip_s``, unless the connection ends before the answer."""
+        with contextlib.suppress(Exception):  # as in ``run``, which notes it
+            if self._connection is not None:
+                self.round_trip_s = await (await self._connection.ping())
+
     def _works(self) -> list[Coroutine[Any, Any, None]]:
         return [*super()._works(), self._send_all(), self._leave_all()]
+
+    def _left_bytes(self) -> int | None:
+        link = self._connection
+        if link is None or (unsent := unsent_bytes(link.transport.get_extra_info("socket"))) is None:
+            return None
+        return unsent + int(link.transport.get_write_buffer_size())
 
     async def _send_all(self) -> None:
         """Send what the queues return, in order, after the messages that the last connection left."""

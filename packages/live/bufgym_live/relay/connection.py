@@ -1,6 +1,7 @@
 """One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
 
 import asyncio
+import hashlib
 import itertools
 import secrets
 import time
@@ -15,8 +16,7 @@ from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import Rule
-from bufgym_live.relay.held import StoredSession
-from bufgym_live.relay.orders import is_stop, order
+from bufgym_live.relay.orders import is_stop, order, robot_of
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
@@ -25,6 +25,7 @@ from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.rules import Permissions
+from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -66,6 +67,7 @@ class Connection:
     async def run(self, greeted: Callable[[], None]) -> None:
         """Serve the client to the end; call ``greeted`` after its welcome."""
         hub, caller, admitted = self._hub, self._caller, self._admitted
+        self.session.answers.update(admitted.whys)
         hub.store.acked(self.session, admitted.received)
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
@@ -74,6 +76,7 @@ class Connection:
         numbers = self.session.received, hub.now_us()
         self.tell("welcome", **protocol.welcome(hub.config, admitted, caller.identity, *numbers))
         greeted()
+        hub.holding.begin(self._tell_outcomes(admitted.open))
         works = self._outbox.run, self._carry_out
         tasks = [asyncio.create_task(hub.turns.of(caller.identity.key, work)) for work in works]
         left_s = min(caller.identity.until_s - time.time(), 2**20)
@@ -94,12 +97,21 @@ class Connection:
         if self._ending is not None:
             await self._ending  # with its reason, which the end of this would not say
 
+    async def _tell_outcomes(self, seqs: Sequence[int]) -> None:
+        """Tell the outcomes of the client's messages of which it has not heard."""
+        for seq in seqs:
+            if (known := self.session.outcomes.get(seq)) is not None:
+                self._hub.tell_outcome(known)
+            elif seq <= self.session.received and not await self._hub.store.waits(self.session, seq):
+                self.tell("delivered", seq=seq, receivers=1, lost=1, why="nobody knows whether it was executed")
+
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
         for heard in itertools.count(1):
             # The reason is on its way: what the client still says is not obeyed.
             if self._ending is not None:
                 break
+            self.session.heard_s = self._hub.clock()
             # A socket with much to read never lets go of the event loop by itself.
             if heard % _MOST_IN_TURN == 0:
                 await asyncio.sleep(0)
@@ -118,9 +130,9 @@ class Connection:
                     self._ids_waiting.append(said["id"])
                     change = partial(self._change, said)
                     await (self._later(change) if late else change())
-                case {"op": "ack", "seq": number}:
+                case {"op": "ack", "seq": number} as said:
                     self._outbox.acked(number)
-                    self._hub.store.acked(self.session, number)
+                    self._hub.store.acked(self.session, number, said.get("why", "")[: protocol.MOST_WHY])
                 case {"op": "may", "topics": topics}:
                     await self._caller.pace(_RIGHT_BYTES * len(topics))
                     self.tell("rights", rights={topic: self._right(topic) for topic in topics})
@@ -206,16 +218,34 @@ class Connection:
                 hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
             at_us = message.at_us or hub.now_us()
             message = message._replace(sender=self._admitted.name, stamp_us=message.stamp_us or at_us, at_us=at_us)
-            most_s, by = self.permissions.command_s(message.topic), who.email or self._admitted.name
-            message = hub.orders.dated(message, most_s, hub.now_us(), by)
-            if not message.no_drop:
+            number = self._number(message) if message.no_drop and robot_of(message.topic) else 0
+            message = message._replace(number=number, seen="")
+            message = hub.orders.dated(message, self.permissions.command_s(message.topic), hub.now_us())
+            if is_stop(message.topic):
+                hub.holding.begin(
+                    self._confirm(message, hub.desk.order(message, who.email or self._admitted.name, who))
+                )
+            elif not message.no_drop:
                 hub.publish(self, message)
-                if is_stop(message.topic):
-                    self.tell("stopped", topic=message.topic, id=order(message)["id"])
             elif not new or await self._hold(message):
                 self.tell("ack", seq=message.seq)
         except RefusedError as refused:
             self._refused(refused, message.topic, message.seq, message.no_drop)
+
+    def _number(self, message: wire.Message) -> int:
+        """Give a command's number: the same however often its client sends it."""
+        about = f"{self.session.identity.key}\n{self.session.name}\n{message.seq}".encode()
+        return int.from_bytes(hashlib.blake2b(about, digest_size=6).digest(), "big")
+
+    async def _confirm(self, message: wire.Message, kept: asyncio.Future[None]) -> None:
+        """Confirm a stop or a release once it is on the disk; until then its client says it again."""
+        try:
+            await kept
+        except RefusedError as refused:
+            why = f"it is in force, but lost when the relay restarts: {refused}"
+            self._refused(RefusedError(refused.code, why), message.topic, message.seq, no_drop=False)
+        else:
+            self.tell("stopped", topic=message.topic, id=order(message)["id"])
 
     def _refused(self, refused: RefusedError, topic: str, seq: int, no_drop: bool) -> None:
         about = {"code": refused.code, "topic": topic, "session": self.session.name}
@@ -296,10 +326,18 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         numbers = admitted.received, admitted.acked
         await hub.store.catch_up(caller.identity, admitted.session, admitted.acked, admitted.received)
+        if admitted.robot:
+            about = caller.identity, admitted.session, admitted.permissions
+            if (other := hub.claims.rival(admitted.robot, *about)) is not None:
+                hub.take_over(*other.key)
+                hub.store.forget(other)  # what waits for it is lost, as its senders are told
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             # Nothing is awaited from ``take_over`` to here, or a second connection of the session could come between.
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
+            session.heard_s = hub.clock()
+            if admitted.robot:
+                hub.claims.claim(admitted.robot, session)
             stage = "frame"
             one = kind(caller, admitted, session, quota)
             await hub.turns.of(caller.identity.key, partial(one.run, greeted))

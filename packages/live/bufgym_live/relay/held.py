@@ -9,69 +9,37 @@ import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.facts import Facts
 from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.rules import Identity
+from bufgym_live.relay.stored import Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
+MOST: Final = 256
+"""Settled messages of a session whose outcomes are remembered."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS session (
     id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
 CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS message (
     id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
-    waiting INTEGER, lost INTEGER);
+    waiting INTEGER, lost INTEGER, until_us INTEGER DEFAULT 0, why TEXT DEFAULT '');
 CREATE TABLE IF NOT EXISTS delivery (
     session INTEGER, number INTEGER, message INTEGER, PRIMARY KEY (session, number)) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS outcome (
+    session INTEGER, seq INTEGER, receivers INTEGER, lost INTEGER, why TEXT, PRIMARY KEY (session, seq)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS stop (robot TEXT, who TEXT, said TEXT, PRIMARY KEY (robot, who)) WITHOUT ROWID;
 """
+_ADDED: Final = ("until_us INTEGER DEFAULT 0", "why TEXT DEFAULT ''")  # columns of message that earlier files lack
 _COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
-
-
-@dataclass(eq=False)
-class StoredSession:
-    """A client's session as the relay keeps it, over all its connections."""
-
-    name: str
-    identity: Identity
-    temporary: bool  # whether the session ends with its connection
-    received: int = 0  # highest number of a no_drop message taken from it
-    numbered: int = 0  # highest number of a no_drop message for it
-    held: int = 0  # number of messages for it that are not acked
-    held_bytes: int = 0
-    durable: dict[str, Pattern] = field(default_factory=dict)  # id -> pattern of messages held for it while away
-    away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
-    kept: bool = False  # whether the store was asked to remember it
-    orders: int = 0  # number of its orders that wait for the disk
-    id: int | None = None  # id on disk, which only the disk's thread reads
-    acked: int = 0  # highest number that it has acked
-    settling: bool = False  # whether acks wait to be written
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """Identity and name; the same name under another identity is another session."""
-        return self.identity.key, self.name
-
-    @property
-    def unused_s(self) -> float:
-        """Time from which on it may be forgotten; infinity while it is here, or an order of it waits."""
-        return math.inf if self.orders else self.away_s
-
-
-class Settled(NamedTuple):
-    """A message that no receiver waits for any more."""
-
-    sender: StoredSession
-    seq: int
-    receivers: int
-    lost: int  # number of receivers whose sessions were forgotten before they acked it
 
 
 class Held:
@@ -88,6 +56,9 @@ class Held:
             for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
+            for column in _ADDED:
+                with suppress(sqlite3.OperationalError):  # it is there
+                    self._db.execute(f"ALTER TABLE message ADD COLUMN {column}")
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
             (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
             if state != "ok":
@@ -102,6 +73,7 @@ class Held:
         self.fault = ""
         """Why the file could not be written at the last try; empty if it could."""
         self.bytes = 0
+        self.facts = Facts(self._db, self)
         self._by_id: dict[int | None, StoredSession] = {}
 
     def load(self) -> Iterator[StoredSession]:
@@ -116,6 +88,8 @@ class Held:
                     session.durable[one] = pattern(text)
             held = "SELECT count(*), coalesce(sum(length(frame)), 0) FROM delivery JOIN message ON id = message"
             session.held, session.held_bytes = self._db.execute(f"{held} WHERE session = ?", (id,)).fetchone()
+            outcomes = "SELECT seq, receivers, lost, why FROM outcome WHERE session = ?"
+            session.outcomes = {row[0]: Settled(session, *row) for row in self._db.execute(outcomes, (id,))}
             self._by_id[id] = session
             if temporary:  # left by a relay that was killed
                 ended.append(session)
@@ -137,10 +111,10 @@ class Held:
 
     def forget(self, session: StoredSession) -> bool:
         """Forget a session and its messages; return whether that could be written."""
-        with self._bearable():
+        with self.bearable():
             if session.id is not None:
-                gone = "DELETE FROM session WHERE id = ?", "DELETE FROM durable WHERE session = ?"
-                self._settle(session, 0, 2**62, 1, *gone)
+                gone = (f"DELETE FROM {table} WHERE session = ?" for table in ("durable", "outcome"))
+                self._settle(session, 0, 2**62, 1, "DELETE FROM session WHERE id = ?", *gone)
                 del self._by_id[session.id]
                 session.id = None
         return session.id is None
@@ -149,24 +123,30 @@ class Held:
         """Write a session again, with numbers that are at least these."""
         session.received, session.numbered = max(session.received, received), max(session.numbered, numbered)
         if session.id is not None:
-            with self._bearable():
+            with self.bearable():
                 self._save(session)
 
     def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Note that matching messages are held while the session is away."""
         if session.id is None:
             self._save(session)
-        with self._transaction(synced=True):
+        with self.transaction(synced=True):
             self._db.execute("INSERT OR REPLACE INTO durable VALUES (?, ?, ?)", (session.id, id, pattern.text))
         session.durable[id] = pattern
 
     def want_no_more(self, session: StoredSession, id: str) -> None:
         """End that."""
-        with self._bearable(), self._transaction():
+        with self.bearable(), self.transaction():
             self._db.execute("DELETE FROM durable WHERE session = ? AND id = ?", (session.id, id))
 
     def hold(
-        self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
+        self,
+        sender: StoredSession,
+        seq: int,
+        topic: str,
+        frame: bytes,
+        receivers: Sequence[StoredSession],
+        until_us: int,
     ) -> bool:
         """Write a message; return whether it is new, not taken meanwhile over another connection."""
         if seq == sender.received:
@@ -176,10 +156,12 @@ class Held:
         for session in (sender, *receivers):
             if session.id is None:
                 self._save(session)
-        with self._transaction(synced=True):
+        with self.transaction(synced=True):
             if receivers:
-                row = sender.id, seq, topic, frame, len(receivers), len(receivers)
-                columns = "(sender, seq, topic, frame, receivers, waiting, lost) VALUES (?, ?, ?, ?, ?, ?, 0)"
+                row = sender.id, seq, topic, frame, len(receivers), len(receivers), until_us
+                columns = (
+                    "(sender, seq, topic, frame, receivers, waiting, lost, until_us) VALUES (?, ?, ?, ?, ?, ?, 0, ?)"
+                )
                 message = self._db.execute(f"INSERT INTO message {columns}", row).lastrowid
             for receiver in receivers:
                 number = receiver.numbered + 1
@@ -234,40 +216,41 @@ class Held:
     def settle_acked(self, session: StoredSession) -> None:
         """End the deliveries that the session has acked; if that cannot be written, a later ack does it."""
         session.settling = False
-        with self._bearable():
+        with self.bearable():
             self._settle(session, 0, session.acked, 0)
+            for number in [one for one in session.answers if one <= session.acked]:
+                session.answers.pop(number, None)
 
-    def deny(self, session: StoredSession, number: int) -> None:
-        """Drop a message that no rule lets the session have any more."""
-        with self._bearable():
+    def deny(self, session: StoredSession, number: int, why: str) -> None:
+        """Drop a message that the session must not have any more."""
+        session.answers[number] = why
+        with self.bearable():
             self._settle(session, number, number, 1)
+        session.answers.pop(number, None)
 
-    def robots(self) -> list[tuple[str, int, str]]:
-        """Read the robots that were here, as ``Store.robots``; none if they cannot be read."""
-        try:
-            return self._db.execute("SELECT name, seen_us, said FROM robot").fetchall()
-        except sqlite3.Error as error:
-            self._audit.repeated(what="store", code="store_full", why=f"the robots cannot be read: {error}")
-            return []
+    def expire(self, now_us: int, why: str) -> None:
+        """Drop the messages whose deadline is over and that no connection is about to ack."""
+        late = "SELECT session, number FROM delivery JOIN message ON id = message WHERE until_us BETWEEN 1 AND ?"
+        for id, number in self._db.execute(late, (now_us,)).fetchall():
+            session = self._by_id.get(id)
+            if session is not None and session.away_s < math.inf:
+                self.deny(session, number, why)
 
-    def keep_robots(self, rows: Sequence[tuple[str, int, str]], most: int) -> None:
-        """Write these, and keep of all only the ``most`` that were here last."""
-        with self._bearable(), self._transaction():
-            self._db.executemany("INSERT OR REPLACE INTO robot VALUES (?, ?, ?)", rows)
-            last = "SELECT name FROM robot ORDER BY seen_us DESC LIMIT ?"
-            self._db.execute(f"DELETE FROM robot WHERE name NOT IN ({last})", (most,))
+    def waits(self, sender: StoredSession, seq: int) -> bool:
+        """Whether a message of this sender is still held."""
+        query = "SELECT 1 FROM message WHERE sender = ? AND seq = ?"
+        return self._db.execute(query, (sender.id, seq)).fetchone() is not None
 
-    def forget_robot(self, name: str) -> None:
-        """Remove a robot."""
-        with self._bearable(), self._transaction():
-            self._db.execute("DELETE FROM robot WHERE name = ?", (name,))
+    def note(self, why: str) -> None:
+        """Log a fault."""
+        self._audit.repeated(what="store", code="store_full", why=why)
 
     def close(self) -> None:
         """Close the file; everything is on disk already."""
         self._db.close()
 
     @contextmanager
-    def _transaction(self, synced: bool = False) -> Iterator[None]:
+    def transaction(self, synced: bool = False) -> Iterator[None]:
         """Commit what the block writes; if ``synced``, a power failure does not undo it, nor what was committed before.
 
         Raises RefusedError: the disk cannot be written; then nothing has changed.
@@ -291,7 +274,7 @@ class Held:
             raise
 
     @contextmanager
-    def _bearable(self) -> Iterator[None]:
+    def bearable(self) -> Iterator[None]:
         """Log that the store cannot be written, and go on."""
         try:
             yield
@@ -302,23 +285,26 @@ class Held:
         """End deliveries to a session; ``also`` are statements about its id for the same transaction."""
         settled, sizes, freed_bytes = [], [], 0
         chosen = "FROM delivery WHERE session = ? AND number BETWEEN ? AND ?"
-        with self._transaction():
-            rows = self._db.execute(f"SELECT message {chosen}", (session.id, first, last)).fetchall()
+        with self.transaction():
+            rows = self._db.execute(f"SELECT message, number {chosen}", (session.id, first, last)).fetchall()
             self._db.execute(f"DELETE {chosen}", (session.id, first, last))
             for statement in also:
                 self._db.execute(statement, (session.id,))
-            for (id,) in rows:
-                (sender, seq, receivers, waiting, gone, size_bytes) = self._db.execute(
-                    "UPDATE message SET waiting = waiting - 1, lost = lost + ? WHERE id = ? "
-                    "RETURNING sender, seq, receivers, waiting, lost, length(frame)",
-                    (lost, id),
+            for id, number in rows:
+                (sender, seq, receivers, waiting, gone, size_bytes, why) = self._db.execute(
+                    "UPDATE message SET waiting = waiting - 1, lost = lost + ?, why = coalesce(nullif(?, ''), why) "
+                    "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why",
+                    (lost, session.answers.get(number, ""), id),
                 ).fetchone()
                 sizes.append(size_bytes)
                 if waiting == 0:
                     self._db.execute("DELETE FROM message WHERE id = ?", (id,))
                     freed_bytes += size_bytes
                     if sender in self._by_id:
-                        settled.append(Settled(self._by_id[sender], seq, receivers, gone))
+                        self._db.execute("DELETE FROM outcome WHERE session = ? AND seq <= ?", (sender, seq - MOST))
+                        row = sender, seq, receivers, gone, why
+                        self._db.execute("INSERT OR REPLACE INTO outcome VALUES (?, ?, ?, ?, ?)", row)
+                        settled.append(Settled(self._by_id[sender], seq, receivers, gone, why))
         # After the commit, too; and only then are senders told.
         session.held -= len(sizes)
         session.held_bytes -= sum(sizes)
@@ -330,7 +316,7 @@ class Held:
         """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
         who = session.identity
         row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
-        with self._transaction():
+        with self.transaction():
             insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
             id = self._db.execute(insert, row).lastrowid
         session.id = id

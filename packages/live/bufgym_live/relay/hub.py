@@ -6,25 +6,30 @@ import asyncio
 import functools
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
+from bufgym_live.relay.claims import Claims
 from bufgym_live.relay.clock import ServerClock
-from bufgym_live.relay.config import Config, Rule
+from bufgym_live.relay.config import Config
+from bufgym_live.relay.desk import Desk
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.drive import Drivers
-from bufgym_live.relay.held import Settled, StoredSession
-from bufgym_live.relay.orders import Orders, is_stop
+from bufgym_live.relay.held import MOST
+from bufgym_live.relay.last import Last
+from bufgym_live.relay.member import Member, OtherRelays
+from bufgym_live.relay.orders import Orders, heard_stops, robot_of
 from bufgym_live.relay.outgoing import Outgoing
-from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.patterns import escaped, pattern
 from bufgym_live.relay.quota import Quotas
 from bufgym_live.relay.recorder import Recorder, Tape
-from bufgym_live.relay.roster import GONE, Roster, is_last
-from bufgym_live.relay.rules import Permissions
+from bufgym_live.relay.roster import GONE, Roster, is_last, status_of
+from bufgym_live.relay.rules import NATS, Permissions
 from bufgym_live.relay.store import Store
+from bufgym_live.relay.stored import Settled, StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.turns import Turns
 from bufgym_live.relay.wire import RefusedError
@@ -37,44 +42,7 @@ STATUS: Final = f"/{wire.OWN}/status"
 CONNECTED: Final = "connected"  # State of the connection to the other relays
 MAX_ROUTES: Final = 10_000
 MOST_IN_TURN: Final = 256  # Latched topics that are offered in a turn of the event loop
-MAX_LATCHED_BYTES: Final = 2**26  # Limit on the last messages of latched topics; beyond, the oldest are forgotten
-
-
-class Member(Protocol):
-    """A connection that has said hello."""
-
-    session: StoredSession
-    permissions: Permissions
-    subscriptions: dict[str, Subscription]
-    sent: int  # number of messages sent to it
-    acks: bool  # whether its client acks no_drop messages; otherwise it gets them like all others
-
-    def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
-        """Offer a message to its queues."""
-
-    def reruled(self, rules: Sequence[Rule]) -> None:
-        """Take new rules; end the connection if none is for it."""
-
-    def wake(self) -> None:
-        """Say that the store has something for it."""
-
-    def tell(self, op: str, **fields: Any) -> None:
-        """Tell its client this before any message."""
-
-    def end(self, why: str) -> None:
-        """Close it."""
-
-
-class OtherRelays(Protocol):
-    """The relays that share topics with this one."""
-
-    state: str  # ``CONNECTED``, or why there is no connection
-
-    async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
-        """Give them a no_drop message; return whether they may have it, None if that is not known."""
-
-    async def close(self) -> None:
-        """Leave them."""
+MAX_STATUS_BYTES: Final = 2**16  # of a status, beyond which no stops are looked for in it
 
 
 class Hub:
@@ -90,13 +58,14 @@ class Hub:
         self.audit = Audit(config.folder, config.audit)
         self.quotas = Quotas(config.limits, clock)
         self.members: dict[StoredSession, Member] = {}
-        self.store = Store(config, self.audit, self._settled, clock)
+        self.store = Store(config, self.audit, self.settled, clock)
         disk = Disk("recordings", self.audit)
         recorder = Recorder.of(config, disk)
         self.tape = None if recorder is None else Tape(recorder, disk)
         self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
+        self.claims = Claims(self.audit, lambda message: self.publish(None, message), clock, self.now_us)
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
@@ -107,11 +76,11 @@ class Hub:
         self._sent = 0
         self._dropped = 0
         self._routes: dict[str, list[tuple[Member, Subscription]]] = {}
-        self._latched: dict[str, Outgoing] = {}
-        self._latched_bytes = 0
+        self._last = Last(self.audit)
         self.peers: OtherRelays | None = None  # the other relays, if it shares topics with any
+        self.desk = Desk(self.orders, self.store, self.audit, self.now_us, self._send, self.holding)
         for message in self.roster.away():
-            self._latch(Outgoing(message))
+            self._last.keep(Outgoing(message), "")
 
     def take_over(self, identity: str, name: str) -> None:
         """End the connection of this session, if it has one, and free its place for the next."""
@@ -161,12 +130,14 @@ class Hub:
 
     async def offer_latched(self, member: Member, subscription: Subscription) -> None:
         """Offer a new subscription what is latched; all others have a turn after some of it."""
-        for k, (topic, frame) in enumerate(list(self._latched.items())):
+        last = [*self.desk.said.items(), *self._last.items()]
+        for k, (topic, frame) in enumerate(last):
             if k % MOST_IN_TURN == 0:
                 await asyncio.sleep(0)
                 if member.subscriptions.get(subscription.id) is not subscription:
                     break
-            newest = self._latched.get(topic) is frame  # otherwise it has got a newer one meanwhile
+            # Otherwise it has got a newer one meanwhile.
+            newest = frame in (self.desk.said.get(topic), self._last.get(topic))
             if newest and subscription.pattern.part(topic) and member.permissions.allow("receive", topic):
                 member.offer(subscription, frame)
 
@@ -191,23 +162,23 @@ class Hub:
         """Offer a message to each subscriber's queue except its sender's."""
         self._show(message)
         outgoing = Outgoing(message)
-        if is_last(message.topic) or is_stop(message.topic) or self.is_latched(message.topic):
-            self._latch(outgoing)
+        if is_last(message.topic) and message.payload == GONE:
+            self._last.forget(message.topic)
+        elif is_last(message.topic) or self.is_latched(message.topic):
+            self._last.keep(outgoing, "" if sender is None else sender.session.identity.key)
+        robot = status_of(message.topic)
+        # Only the robot itself knows its stops, and the relay where it is.
+        if sender is not None and robot and (sender.session.identity == NATS or sender.session.robot == robot):
+            if b'"stops"' in bytes(message.payload[:MAX_STATUS_BYTES]):
+                self.desk.take(robot, heard_stops(message), sender, sender.session.identity.key)
+        self._send(sender, outgoing)
+
+    def _send(self, sender: Member | None, outgoing: Outgoing) -> None:
+        """Offer it to each subscriber but its sender."""
+        message = outgoing.message
         for member, subscription in self._route(message.topic):
             if member is not sender:
                 member.offer(subscription, outgoing)
-
-    def _latch(self, outgoing: Outgoing) -> None:
-        """Keep it in place of its topic's last message."""
-        before = self._latched.pop(outgoing.message.topic, None)
-        self._latched_bytes -= before.size_bytes if before else 0
-        if is_last(outgoing.message.topic) and outgoing.message.payload == GONE:
-            return
-        self._latched[outgoing.message.topic] = outgoing
-        self._latched_bytes += outgoing.size_bytes
-        while self._latched_bytes > MAX_LATCHED_BYTES:
-            oldest = next(topic for topic in self._latched if not is_stop(topic))
-            self._latched_bytes -= self._latched.pop(oldest).size_bytes
 
     def _show(self, message: wire.Message) -> None:
         """Count a message, and show it to the relay's own parts."""
@@ -260,10 +231,14 @@ class Hub:
         if not receivers and not shared:
             alone = self.peers is not None and self.peers.state != CONNECTED
             other = ", and the other relays are out of reach" if alone else ""
-            raise RefusedError("no_receiver", f"topic {message.topic}: nobody receives it{other}")
+            robot = robot_of(message.topic)
+            why = f"robot {robot} is not here" if robot else f"topic {message.topic}: nobody receives it"
+            raise RefusedError("no_receiver", why + other)
+        if robot_of(message.topic) and not receivers and self.peers is not None:
+            self.peers.awaits(sender.session, message)
         frame = wire.encode(message)
         number = message.seq if taken is None else taken
-        if not await self.store.hold(sender.session, number, message.topic, frame, receivers):
+        if not await self.store.hold(sender.session, number, message.topic, frame, receivers, message.until_us):
             return
         self._show(message)
         for session in receivers:
@@ -275,21 +250,42 @@ class Hub:
                 member.offer(subscription, outgoing)
 
     def _holders(self, sender: Member, topic: str) -> list[StoredSession]:
-        """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again."""
-        here = [member.session for member, _ in self._route(topic) if member is not sender and member.acks]
+        """Find the sessions that should get a no_drop message: here, away, or back and about to subscribe again.
+
+        A command waits for the session that has claimed its robot, here or away. Without one it waits for those who
+        subscribe to this robot's topics alone, and never for who merely watches all.
+        """
+        robot = robot_of(topic)
+        if robot and (session := self.claims.get(robot)) is not None:
+            return [] if session is sender.session else [session]
+        own = f"^/robots/{escaped(robot)}/" if robot else ""
+        here = [
+            member.session
+            for member, subscription in self._route(topic)
+            if member is not sender and member.acks and subscription.pattern.text.startswith(own)
+        ]
         away = [
             each
             for each in self.store.sessions.values()
             if each is not sender.session and each not in here
-            if any(wanted.part(topic) for wanted in list(each.durable.values()))
+            if any(wanted.text.startswith(own) and wanted.part(topic) for wanted in list(each.durable.values()))
             if Permissions(self.config.rules, each.identity).allow("receive", topic)
         ]
         return here + away
 
-    def _settled(self, message: Settled) -> None:
-        """Tell the sender of a message its outcome."""
+    def settled(self, message: Settled) -> None:
+        """Tell the sender of a message its outcome, and remember that for its next connection."""
+        outcomes = message.sender.outcomes
+        outcomes[message.seq] = message
+        if len(outcomes) > MOST:
+            del outcomes[next(iter(outcomes))]
+        self.tell_outcome(message)
+
+    def tell_outcome(self, message: Settled) -> None:
+        """Tell the sender of a message its outcome, if it is here."""
         if message.sender in self.members:
-            about = {"seq": message.seq, "receivers": message.receivers, "lost": message.lost}
+            about: dict[str, Any] = {"seq": message.seq, "receivers": message.receivers, "lost": message.lost}
+            about |= {"why": message.why} if message.why else {}
             self.members[message.sender].tell("delivered", **about)
 
     def status(self) -> dict[str, Any]:
@@ -319,7 +315,9 @@ class Hub:
         self.roster.tick()
         self.drivers.tick()
         self.quotas.tidy()
-        self.store.tick()
+        self.store.tick(now_us)
+        if self.peers is not None:
+            self.peers.tick()
         for disk in self.disks:
             disk.tick()
 

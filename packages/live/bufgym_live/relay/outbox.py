@@ -13,8 +13,9 @@ from websockets.exceptions import WebSocketException
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
-from bufgym_live.relay.hub import Member
+from bufgym_live.relay.member import Member
 from bufgym_live.relay.outgoing import Outgoing
+from bufgym_live.relay.store import NOT_REACHED
 from bufgym_live.relay.subscriber import Lane, Subscription, make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
@@ -143,7 +144,9 @@ class Outbox:
                 self._in_flight.append(self._sent_number)
                 await self._send(Outgoing(message))
             else:
-                self._hub.store.denied(member.session, self._sent_number)
+                late = over and self._hub.orders.is_late(message, self._hub.now_us())
+                why = NOT_REACHED if late else "withdrawn by a stop" if over else "no rule lets its robot have it"
+                self._hub.store.denied(member.session, self._sent_number, why)
         return True
 
     async def _send(self, outgoing: Outgoing) -> None:

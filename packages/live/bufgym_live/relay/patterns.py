@@ -48,6 +48,22 @@ class Pattern(NamedTuple):
         return self.compiled.search(topic) is not None
 
 
+def escaped(text: str) -> str:
+    """Write a text as an expression that matches it alone, in all three languages."""
+    return re.sub(r"[.^$*+?{}\[\]\\|()]", r"\\\g<0>", text)
+
+
+def exactly(topic: str) -> str:
+    """Write the expression that only this whole topic matches."""
+    return f"^{escaped(topic)}$"
+
+
+def topic_of(text: str) -> str | None:
+    """Give the topic of which ``exactly`` made an expression; None for any other."""
+    topic = re.sub(r"\\(.)", r"\1", text[1:-1])
+    return topic if exactly(topic) == text else None
+
+
 @functools.lru_cache(_KEPT)
 def for_client(text: str) -> re.Pattern[str]:
     """Compile an expression with Python alone; raise an error if it is not one of the common language."""

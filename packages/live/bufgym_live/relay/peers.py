@@ -9,23 +9,27 @@ own receivers. NATS keeps it until every relay has taken it, also one that is aw
 
 import asyncio
 import hashlib
+import json
 import math
 import re
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies, protocol, wire
+from bufgym_live.relay.answers import Answers
 from bufgym_live.relay.backoff import Backoff
-from bufgym_live.relay.bus import HOLD, MESSAGE, TRIES, Bus, options
+from bufgym_live.relay.bus import HOLD, MESSAGE, TOLD, TRIES, Bus, options
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
-from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import CONNECTED, Hub
+from bufgym_live.relay.ledger import read
+from bufgym_live.relay.orders import STOP, heard_stops, is_stop, stopped_robot
 from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
+from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.subscriber import Subscription, make_one, next_lane
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
@@ -69,6 +73,9 @@ class Peers:
         self._doubtful = dict[str, None]()
         """Ids of the messages of which NATS has not said whether it has them, in order."""
         self._awake = asyncio.Event()
+        self._answers = Answers(hub)
+        self._telling: deque[bytes] = deque()
+        """What is to be said to the others before any message."""
         self._tasks = Tasks()
 
     async def start(self) -> None:
@@ -88,12 +95,14 @@ class Peers:
         while True:
             bus = Bus(self._settings, self._hub.config.store, self._note, most)
             try:
-                await bus.open(self._options, self._heard, self._known)
+                await bus.open(self._options, self._heard, self._told, self._known)
                 self._bus = bus
                 backoff.connected()
                 # Only now: while NATS is away nothing must queue up for it.
                 everything = Subscription("all", pattern(""), policy, DEFAULT_CAPACITY)
                 await self._hub.subscribe(self, everything)
+                self._telling.clear()
+                self._tell(ask=True)
                 await self._hub.offer_latched(self, everything)
                 self._becomes(CONNECTED)
                 if not tried.done():
@@ -135,7 +144,9 @@ class Peers:
 
     def offer(self, subscription: Subscription, outgoing: Outgoing) -> None:
         """Offer a message of this relay."""
-        if not outgoing.message.no_drop and self._goes("receive", outgoing.message.topic):
+        if is_stop(outgoing.message.topic):
+            self._offer_stops(outgoing.message)
+        elif not outgoing.message.no_drop and self._goes("receive", outgoing.message.topic):
             subscription.offer(outgoing.message.topic, (outgoing, time.time_ns() // 1000), outgoing.size_bytes)
             self._awake.set()
 
@@ -144,6 +155,8 @@ class Peers:
         while True:
             await self._awake.wait()
             self._awake.clear()
+            while self._telling:
+                await bus.tell(self._telling.popleft())
             while await make_one(list(self.subscriptions.values()), self._hub.making):
                 pass
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
@@ -157,6 +170,35 @@ class Peers:
                     except wire.RefusedError as refused:
                         self._note(refused)
                 lane.gone()
+                while self._telling:
+                    await bus.tell(self._telling.popleft())
+
+    def _offer_stops(self, message: wire.Message) -> None:
+        if self._goes("receive", message.topic):
+            stops = [stop.as_json() for stop in heard_stops(message)]
+            self._tell(robot=stopped_robot(message.topic), stops=stops)
+
+    def _tell(self, **said: Any) -> None:
+        self._telling.append(json.dumps({"relay": self._settings.name, **said}).encode())
+        self._awake.set()
+
+    def _told(self, data: bytes) -> None:
+        """Take what another relay says: a robot's stops, how a command ended, or a question for all stops."""
+        try:
+            said = json.loads(data)
+        except (ValueError, RecursionError):
+            said = None
+        match said:
+            case {"relay": str(), "ask": True}:
+                for outgoing in self._hub.desk.said.values():
+                    self._offer_stops(outgoing.message)
+            case {"relay": str(), "robot": str(robot), "stops": list(stops)} if "/" not in robot:
+                if self._goes("send", f"/robots/{robot}/{STOP}"):
+                    self._hub.desk.take(robot, list(read(stops)), self, self.session.identity.key)
+            case {"relay": str(), "seq": int(number), "lost": int(lost), "why": str(why)}:
+                self._answers.came(number, lost, why)
+            case _:
+                self._note(f"{TOLD}: {data[:60]!r}: nothing that a relay of this version says")
 
     def _heard(self, heard: Any) -> bool:
         """Publish a message of another relay here; return whether fewer should come at a time."""
@@ -197,7 +239,7 @@ class Peers:
         until_us = max(1, now_us + int(left) - round(extra_s * 1e6)) if re.fullmatch("[0-9]{1,15}", left) else 0
         here = message._replace(at_us=now_us, until_us=until_us)
         try:
-            return self._hub.orders.dated(here, self.permissions.command_s(message.topic), now_us, None)
+            return self._hub.orders.dated(here, self.permissions.command_s(message.topic), now_us)
         except wire.RefusedError as refused:
             self._note(refused)
             return None
@@ -213,8 +255,7 @@ class Peers:
         if not self._goes("receive", message.topic):
             return False
         frame = wire.encode(_undated(message))
-        origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
-        id = hashlib.blake2b(origin + frame, digest_size=16).hexdigest()  # the same when it is sent again
+        id = self._id(sender, message)
         if self._bus is None:
             return None if id in self._doubtful else False
         put_us = str(time.time_ns() // 1000)
@@ -226,6 +267,26 @@ class Peers:
             return None
         self._doubtful.pop(id, None)
         return True
+
+    def _id(self, sender: StoredSession, message: wire.Message) -> str:
+        """Name a no_drop message, the same when it is sent again."""
+        origin = f"{self._settings.name}\n{sender.identity.key}\n{sender.name}\n".encode()
+        frame = wire.encode(_undated(message)._replace(seen=""))
+        return hashlib.blake2b(origin + frame, digest_size=16).hexdigest()
+
+    def awaits(self, sender: StoredSession, message: wire.Message) -> None:
+        """Note that another relay will say how a command of this one ended."""
+        if sender is not self.session:
+            self._answers.await_one(_number(self._id(sender, message)), sender, message)
+
+    def tick(self) -> None:
+        """Give up the answers that do not come."""
+        self._answers.tick()
+
+    def tell(self, op: str, **fields: Any) -> None:
+        """Tell the others how a command of theirs ended."""
+        if op == "delivered":
+            self._tell(seq=fields["seq"], lost=fields["lost"], why=fields.get("why", ""))
 
     async def _take_all(self, bus: Bus) -> None:
         while True:
@@ -239,7 +300,7 @@ class Peers:
             self._note(f"{HOLD}: a message without the headers Nats-Msg-Id and Relay")
             await heard.term()
             return
-        number = int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
+        number = _number(id)
         message = None if relay == self._settings.name else self._read(heard)
         if message is not None and re.fullmatch("[0-9]{1,17}", put := headers.get("Put", "")):
             extra_s = self._delays[relay].extra_s(time.time() - int(put) / 1e6, self._hub.clock())
@@ -260,7 +321,12 @@ class Peers:
     def _ignore(self, *words: Any, **fields: Any) -> None:
         """Do nothing: the others are told nothing, no message is held for them, and they end with the relay."""
 
-    wake = tell = end = _ignore
+    wake = end = _ignore
+
+
+def _number(id: str) -> int:
+    """Give a message's number by its name at NATS."""
+    return int(hashlib.blake2b(id.encode(errors="replace"), digest_size=6).hexdigest(), 16)
 
 
 def _undated(message: wire.Message) -> wire.Message:

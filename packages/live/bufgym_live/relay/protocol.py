@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -14,11 +15,12 @@ import msgspec
 from bufgym.model.checks import whole
 from bufgym_live.relay import wire
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Config, Rule
-from bufgym_live.relay.held import StoredSession
+from bufgym_live.relay.orders import is_stop
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.roster import GONE, is_last
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError, WireError
 
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from bufgym_live.relay.policies import Rule as Chosen
 
 MAX_PRIORITY: Final = 1e6
+MOST_WHY: Final = 300  # Characters of why a command was not executed
+MOST_OPEN: Final = 256  # Messages whose outcome a client asks for with its hello
 MAX_CAPACITY: Final = 1_000  # Largest L of a subscriber's queue
 ORDERS: Final = ("subscribe", "unsubscribe", "may", "publish", "ack", "clock", "recordings", "replay")
 _TOLD: Final = ("send", "receive", "topic", "command_s")  # of a rule, to its client
@@ -44,6 +48,9 @@ class Admitted(NamedTuple):
     form: str
     received: int  # highest number of a no_drop message that it has
     acked: int  # highest number of its own that a relay has acked
+    robot: str = ""  # the robot that it claims to be
+    open: tuple[int, ...] = ()  # numbers of its own of which it has not heard how they ended
+    whys: Mapping[int, str] = MappingProxyType({})  # number of a message that it has -> why it did not execute it
 
 
 def hello(data: bytes | str) -> dict[str, Any]:
@@ -73,7 +80,14 @@ def admit(said: Mapping[str, Any], identity: Identity, rules: Sequence[Rule], fr
     numbers = int(said.get("received", 0)), int(said.get("acked", 0))
     if max(numbers) >= wire.MAX_SEQ:
         raise WireError(f"hello: received, acked = {numbers}: must be less than {wire.MAX_SEQ}, for a next one")
-    return Admitted(permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers)
+    robot, open = said.get("robot", ""), tuple(said.get("open", ())[:MOST_OPEN])
+    told = list(said.get("whys", {}).items())[:MOST_OPEN]
+    whys = {int(seq): why[:MOST_WHY] for seq, why in told if seq.isdecimal() and len(seq) <= 16}
+    if robot and "session" not in said:
+        raise WireError("hello: robot: needs a session of a name")
+    return Admitted(
+        permissions, name, session, "session" not in said, said.get("form", "binary"), *numbers, robot, open, whys
+    )
 
 
 def welcome(config: Config, admitted: Admitted, identity: Identity, received: int, clock_us: int) -> dict[str, Any]:
@@ -123,7 +137,8 @@ def check(
     quota.message(len(message.payload), now_s)
     if topic.startswith(f"/{wire.OWN}/") or not permissions.allow("send", topic):
         raise RefusedError("unauthorized", f"topic {topic}: no rule allows to send there")
-    quota.topic(topic, session.name)
+    if not is_stop(topic):  # whatever else its sender says
+        quota.topic(topic, session.name)
     if message.no_drop != no_drop:
         raise RefusedError("wrong", f"topic {topic}: is {'not ' if message.no_drop else ''}no_drop here")
     check_json(message)

@@ -12,10 +12,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import secrets
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from operator import methodcaller
 from typing import Any, Final, Protocol
 
@@ -27,16 +29,21 @@ from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Stream
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
+from bufgym_live.relay.claims import check_name
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.drive import TOPIC, Drive, Velocity
+from bufgym_live.relay.kept import Kept, place
 from bufgym_live.relay.latch import Latch
+from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.monitor import Monitor
-from bufgym_live.relay.orders import STOP, order
+from bufgym_live.relay.orders import STOP, heard_stops
+from bufgym_live.relay.patterns import exactly
 from bufgym_live.relay.place import Place
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
+MOST_BEGUN: Final = 256  # Commands that are remembered, longer than any of them is worth
 POLICIES: Final = ("robofleet", "afr", "min-motion-gap", "drop-oldest", "drop-newest", "fifo", "gap-priority")
 """Policies that a viewer may choose by default."""
 _RATES_HZ: Final = {"status": 1 / STATUS_S, "queue": 1 / QUEUE_S}
@@ -87,8 +94,7 @@ class Robot:
         ``odometry`` names the source's topic that says where the robot is and gives x, as
         ``bufgym_live.relay.place`` says.
         """
-        if not name or "/" in name:
-            raise BufgymError(f"robot {name!r}: a name must be a text without '/'")
+        check_name(name)
         self.name, self.source = name, source
         streams = [*source.streams]
         streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]
@@ -101,14 +107,22 @@ class Robot:
         self.place = Place(odometry)
         self._began_s = time.monotonic()
         settings = {"topics": topics, "policy": policy, "value": value, "log": self.monitor, **session}
-        self.client = RobotClient(url, name, **settings)
-        self.client.subscribe(f"^{self.topic('command')}$", self._command)
-        self.client.subscribe(f"^{self.topic(STOP)}$", self._ordered)
-        self.client.late, self.client.reads_on = self._late, True
+        self.client = RobotClient(url, name, robot=name, **settings)
+        self._kept = Kept(place(self.client.address.netloc, name))
+        self.latch = Latch(self._kept.load())
+        self._said: list[dict[str, Any]] = self.latch.ledger.as_json()
+        self._saving = asyncio.Lock()
         self._drive = Drive(self._move)
-        self.latch = Latch()
+        if self.latch.is_set:
+            self._drive.stop()
         self._tasks = Tasks()
-        self.client.subscribe(f"^{self.topic(TOPIC)}$", self._driven)
+        self._begun: dict[int, asyncio.Task[str]] = {}
+        """Number of a command -> its work, so that one that comes again, after a break, is not begun twice."""
+        # The stops first: they are there before a command that waited.
+        self.client.subscribe(exactly(self.topic(STOP)), self._ordered)
+        self.client.subscribe(exactly(self.topic("command")), self._command)
+        self.client.subscribe(exactly(self.topic(TOPIC)), self._driven)
+        self.client.late, self.client.reads_on = self._late, True
 
     def topic(self, name: str) -> str:
         """Put the robot's prefix before a topic's name."""
@@ -151,6 +165,7 @@ class Robot:
             "answer": self._answer,
             "driver": self._drive.driver,
             "stop": self.latch.status,
+            "stops": self._said,
             **own,
             "commands": sorted({*own.get("commands", ()), "stop", "release"}),
         }
@@ -164,11 +179,15 @@ class Robot:
         async def queue() -> None:
             self.say("queue", self.monitor.state())
 
+        if self._kept.fault:
+            self.client.note(self._kept.fault)
         own = [(STATUS_S, status), (STATUS_S, self.client.ping), (QUEUE_S, queue)]
         every = [self._every(period_s, work) for period_s, work in own]
         try:
             await until_one_ends(self._drive.run(), self.source.run(self), self.client.run(), *every)
         finally:
+            for work in self._begun.values():
+                work.cancel()
             await self._tasks.end()
 
     async def _every(self, period_s: float, work: Callable[[], Awaitable[None]]) -> None:
@@ -200,27 +219,45 @@ class Robot:
         if message.topic != self.topic(TOPIC):
             self._answered(message, "came too late")
 
-    async def _command(self, message: wire.Message) -> None:
+    async def _command(self, message: wire.Message) -> str:
         try:
             command = json.loads(bytes(message.payload))
         except ValueError:
-            return  # a sender's mistake is no reason for a robot to stop
+            return "it is no JSON"  # a sender's mistake is no reason for a robot to stop
+        why = await self.once(message, partial(self._execute, message, command))
+        self._answered(message, why)
+        return why
+
+    async def once(self, message: wire.Message, work: Callable[[], Coroutine[Any, Any, str]]) -> str:
+        """Begin the work on a command unless it was begun before, and wait for why it was not done, if so.
+
+        The work goes on while a broken connection is made anew; then the command comes again.
+        """
+        task = self._begun.get(message.number) if message.number else None
+        if task is None:
+            task = asyncio.create_task(work())
+            self._begun[message.number or -id(task)] = task
+            while len(self._begun) > MOST_BEGUN and next(iter(self._begun.values())).done():
+                del self._begun[next(iter(self._begun))]
+        return await asyncio.shield(task)
+
+    async def _execute(self, message: wire.Message, command: Any) -> str:
+        """Execute a command; return why not."""
         kind, why = command.get("command") if isinstance(command, dict) else None, self.refusal(message)
         try:
             if why:
-                pass
-            elif kind == STOP:
-                self._stop(message, str(command.get("id", "")), message.sender)
-                return
-            elif kind == "policy":
+                return why
+            if kind == STOP:
+                self._stop([Stop(f"command-{secrets.token_hex(8)}", 1, message.sender, message.at_us)])
+                return ""
+            if kind == "policy":
                 if command.get("policy") not in self._policies:
                     raise BufgymError(f"policy {command.get('policy')!r}: must be one of {', '.join(self._policies)}")
                 await asyncio.to_thread(self.client.change, command["policy"])
-            else:
-                why = await self.latch.unless_stopped(self._tasks.begin(self._done(command)))
+                return ""
+            return await self.latch.unless_stopped(self._tasks.begin(self._done(command)))
         except BufgymError as error:
-            why = str(error)
-        self._answered(message, why)
+            return str(error)
 
     async def _done(self, command: Any) -> None:
         await self.source.on_command(command)
@@ -229,35 +266,39 @@ class Robot:
         """Have the status say how a command went."""
         with suppress(ValueError):
             command = json.loads(bytes(message.payload))
-            self._answer = {"id": str(command.get("id"))[:64] if isinstance(command, dict) else "", "why": why[:300]}
+            self._say_answer(str(command.get("id")) if isinstance(command, dict) else "", why)
+
+    def _say_answer(self, id: str, why: str) -> None:
+        self._answer = {"id": id[:150], "why": why[:300]}
         self.say("status", self.status())
 
     def _ordered(self, message: wire.Message) -> None:
-        """Take a stop or a release; the relay says the last one again on each connection."""
-        try:
-            said = order(message)
-        except wire.RefusedError as error:
-            self.client.note(str(error))
+        """Take the ledger that the relay says."""
+        self._stop(heard_stops(message))
+
+    def _stop(self, stops: Sequence[Stop]) -> None:
+        """Take stops and releases: stand at once, waiting for nothing that is under way."""
+        new = self.latch.take(stops)
+        if not new:
             return
-        if said["command"] == STOP:
-            self._stop(message, said["id"], said["by"])
-        elif self.latch.is_set:
-            late = message.until_us > 0 and self.client.deadlines.clock.is_past(message.until_us)
-            why = "came too late" if late else self.latch.release(said["of"])
-            if not why:
-                self._drive.go()
-            self._answered(message, why)
-
-    def _stop(self, message: wire.Message, id: str, by: str) -> None:
-        """Stand, at once: nothing that is under way is waited for."""
-        if self.latch.stop(id, by, message.at_us):
+        if any(stop.holds for stop in new):
             self._drive.stop()
-            self._tasks.begin(self._stopped(message))
+        elif not self.latch.is_set:
+            self._drive.go()
+        self._tasks.begin(self._stopped(new))
 
-    async def _stopped(self, message: wire.Message) -> None:
+    async def _stopped(self, new: Sequence[Stop]) -> None:
+        """Tell the program of a stop, write all down, and then confirm it."""
         why = ""
-        try:
-            await self.source.on_command({"command": STOP})
-        except BufgymError as error:
-            why = str(error)
-        self._answered(message, why)
+        if any(stop.holds for stop in new):
+            try:
+                await self.source.on_command({"command": STOP})
+            except BufgymError as error:
+                why = str(error)
+        async with self._saving:
+            said = self.latch.ledger.as_json()
+            await asyncio.to_thread(self._kept.save, said)
+            self._said = said
+        if self._kept.fault:
+            self.client.note(self._kept.fault)
+        self._say_answer(new[-1].id, why)

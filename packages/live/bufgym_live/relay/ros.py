@@ -15,6 +15,7 @@ from typing import Any, Final
 from bufgym.scenario import Stream
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import ros_messages, wire
+from bufgym_live.relay.patterns import escaped
 from bufgym_live.relay.robot import Robot
 from bufgym_live.robot.ros1 import needs_rospy
 from bufgym_live.robot.ros2.names import Published
@@ -62,10 +63,13 @@ class _RosSource:
         before = robot.topic("to")
         self._advertise, self._is_stopped = advertise, lambda: robot.latch.is_set
 
-        async def take(message: wire.Message) -> None:
+        async def take(message: wire.Message) -> str:
+            return await robot.once(message, functools.partial(publish_it, message))
+
+        async def publish_it(message: wire.Message) -> str:
             name = message.topic.removeprefix(before)
             if name not in self._receive or message.encoding != "cdr":
-                return
+                return f"this robot takes {', '.join(self._receive)} in CDR"
             try:
                 outlet = await self._outlet(Published(name, message.type))
                 publish = outlet(bytes(message.payload))
@@ -76,9 +80,11 @@ class _RosSource:
                 publish()
             except Exception as error:  # messages are untrusted, and ROS has its own error types
                 robot.client.note(f"{message.topic}: not published: {error}")
+                return f"not published: {error}"
+            return ""
 
         if self._receive:
-            robot.client.subscribe(f"^{before}/", take)
+            robot.client.subscribe(f"^{escaped(before)}/", take)
 
     async def _outlet(self, topic: Published) -> Outlet:
         """Publisher of a topic here, which is made when it is first asked for."""

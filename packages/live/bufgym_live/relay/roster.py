@@ -33,6 +33,13 @@ def is_last(topic: str) -> bool:
     return found is not None and found[2] == "last"
 
 
+@lru_cache(10 * MOST_ROBOTS)
+def status_of(topic: str) -> str:
+    """Give the robot whose status the topic carries; empty for any other topic."""
+    found = _TOPIC.fullmatch(topic)
+    return found[1] if found is not None and found[2] == "status" else ""
+
+
 def _said(payload: bytes) -> str:
     """Return what is kept of a status, as JSON."""
     with suppress(ValueError, RecursionError):

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 
 from bufgym_live.relay.config import Rule
 from bufgym_live.relay.orders import COMMAND_S, right
-from bufgym_live.relay.patterns import pattern
+from bufgym_live.relay.patterns import pattern, topic_of
 from bufgym_live.relay.wire import RefusedError
 
 Verb = Literal["send", "receive"]
@@ -117,8 +117,7 @@ class Permissions:
 
         Raises RefusedError: there is none.
         """
-        topic = text[1:-1]
-        if text == f"^{topic}$" and not set(topic) & set(r".^$*+?{}[]\|()"):
+        if (topic := topic_of(text)) is not None:
             if not self.allow("receive", topic):
                 raise RefusedError("unauthorized", f"topic {topic}: no rule allows to receive it")
         elif not self.receives:

@@ -28,9 +28,9 @@ from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wanted import OnMessage, Wanted
 from bufgym_live.relay.wire import RefusedError
-from bufgym_live.robot.sockets import unsent_bytes
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
+MOST_WHYS: Final = 64  # Refused commands of which a new connection tells
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
 _FOR_GOOD: Final = ("unauthorized", "wrong")  # Codes of refusals that no waiting fixes
 
@@ -47,12 +47,14 @@ class Session:
         url: str,
         name: str,
         *,
+        robot: str = "",
         token: str | Callable[[], str | None] | None = None,
         tls: ssl.SSLContext | None = None,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """
         Args:
+            robot: name of the robot that this is; commands to that robot wait for this session, and no other has it.
             url: the relay's, ``ws://HOST:PORT`` or ``wss://HOST:PORT``; of several with commas between them, the
                 first is home, and the others stand in while it is away.
             name: sender's name as others see it.
@@ -63,7 +65,7 @@ class Session:
         """
         self._addresses = [address.parsed(one.strip()) for one in url.split(",")]
         self._at, self._home = 0, Backoff()
-        self.name = name
+        self.name, self.robot = name, robot
         self.connected = asyncio.Event()
         """Set while the relay has accepted the connection."""
         self.ready = asyncio.Event()
@@ -83,11 +85,11 @@ class Session:
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
         self._unanswered = Unanswered(self.deadlines.dated)
-        self._stops = Stops(self.deadlines.dated)
+        self._stops = Stops(self.deadlines.dated, self._session)
         self._inbox = Inbox()
         self._wanted = asyncio.Event()
-        self._received = [0, 0]
-        """Number of the last no_drop message received from home and from the relay that stands in."""
+        self._received = [0, 0]  # number of the last no_drop message from home and from the relay that stands in
+        self._whys: dict[str, str] = {}  # number of a no_drop message from home -> why it was not executed
         self._subscriptions = Wanted()
         self._connection: Any = None
         self._tasks = Tasks()
@@ -103,13 +105,15 @@ class Session:
         return self._at > 0
 
     async def command(self, topic: str, data: Any, type: str = "") -> None:
-        """Send ``data`` on a no_drop topic and wait until the relay holds it; it arrives exactly once.
+        """Send ``data`` on a no_drop topic; it arrives exactly once.
 
-        A command to a robot has the deadline of the relay's rule (``command_s``), counted from this call. With a ROS
-        ``type``, such as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as JSON.
+        A command to a robot has the deadline of the relay's rule (``command_s``), counted from this call; this returns
+        once the robot has executed it. On any other topic it returns once the relay holds it. With a ROS ``type``, such
+        as ``geometry_msgs/msg/Twist``, data are bytes in CDR; otherwise they are sent as JSON.
 
         Raises:
-            BufgymError: the relay refused it, or it is no JSON; the error says why.
+            BufgymError: it is no JSON, or the relay or the robot refused it, or it did not reach the robot in time; the
+                error says which, and why. After a fault of the relay nobody may know.
         """
         encoding = "cdr" if type else "json"
         payload = data if type else wire.written(topic, data)
@@ -132,9 +136,7 @@ class Session:
     async def _order(self, robot: str, **said: str) -> str:
         id, answered = self._stops.put(robot, **said)
         if self.connected.is_set():
-            with contextlib.suppress(
-                Exception
-            ):  # as in ``run``, which notes it, and says it again on the next connection
+            with contextlib.suppress(Exception):  # as in ``run``, which notes it, and says it again later
                 await self._stops.send(self._connection.send)
         await answered
         return id
@@ -244,6 +246,8 @@ class Session:
             self._received[1] = 0
         else:
             hello |= {"session": self._session, "received": self._received[0], "acked": self._unanswered.acked}
+            more = {"robot": self.robot, "open": self._unanswered.open, "whys": self._whys}
+            hello |= {name: value for name, value in more.items() if value}
         self.deadlines.begin()
         await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
@@ -280,24 +284,12 @@ class Session:
                     (await address.reached(self._addresses[0])).close()
                 raise HomeIsBack
 
-    def _left_bytes(self) -> int | None:
-        link = self._connection
-        if link is None or (unsent := unsent_bytes(link.transport.get_extra_info("socket"))) is None:
-            return None
-        return unsent + int(link.transport.get_write_buffer_size())
-
     async def _send_no_drop(self) -> None:
         while True:
             while (message := self._unanswered.next()) is not None:
                 await self._connection.send(wire.encode(message))
             self._wanted.clear()
             await self._wanted.wait()
-
-    async def ping(self) -> None:
-        """Measure ``round_trip_s``, unless the connection ends before the answer."""
-        with contextlib.suppress(Exception):  # as in ``run``, which notes it
-            if self._connection is not None:
-                self.round_trip_s = await (await self._connection.ping())
 
     async def _hear_all(self) -> None:
         async for frame in self._connection:
@@ -320,16 +312,22 @@ class Session:
             return  # it came before the connection broke
         if self.deadlines.is_late(message):
             self.late(message)
+            why = "came too late"
         else:
-            await self._subscriptions.call(message)
+            why = await self._subscriptions.call(message)
         if message.no_drop:
             self._received[self.stands_in] = message.seq
+            if why and not self.stands_in:
+                self._whys[str(message.seq)] = why[:300]
+                self._whys = dict(list(self._whys.items())[-MOST_WHYS:])
             # After the program has had it: if the connection breaks before, the relay sends it again.
-            await self._say_it("ack", seq=message.seq)
+            await self._say_it("ack", seq=message.seq, **({"why": why} if why else {}))
 
     def _answer(self, said: dict[str, Any]) -> None:
         if said["op"] == "ack":
             self._unanswered.ack(said["seq"])
+        elif said["op"] == "delivered":
+            self._unanswered.delivered(said["seq"], said.get("why", ""))
         elif said["op"] == "clock":
             self.deadlines.answered(said)
         elif said["op"] == "stopped":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import secrets
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -17,16 +16,20 @@ from bufgym_live.relay.orders import STOP
 class Stops:
     """Stops and releases of one client that the relay has not confirmed."""
 
-    def __init__(self, dated: Callable[[wire.Message, float], wire.Message]) -> None:
-        """``dated`` gives a release its deadline by when it was put, or raises a BufgymError where that is over."""
-        self._dated = dated
+    def __init__(self, dated: Callable[[wire.Message, float], wire.Message], who: str) -> None:
+        """``dated`` gives a release its deadline by when it was put, or raises a BufgymError where that is over.
+
+        ``who`` is this client's own name in stops, which nobody else has.
+        """
+        self._dated, self._who = dated, who
         self._numbers = itertools.count(1)
         self._waiting: dict[int, tuple[wire.Message, float, asyncio.Future[None]]] = {}
         """Number of a message -> the message, when it was put, and its answer."""
 
     def put(self, robot: str, **said: str) -> tuple[str, asyncio.Future[None]]:
         """Add one; return its id, and a future that is done once the relay has it."""
-        number, id = next(self._numbers), secrets.token_hex(8)
+        number = next(self._numbers)
+        id = f"{self._who}-{number}"
         topic = f"/robots/{robot}/{STOP}"
         message = wire.Message(topic, wire.written(topic, {**said, "id": id}), seq=number)
         answered: asyncio.Future[None] = asyncio.get_running_loop().create_future()

@@ -11,15 +11,20 @@ come and go, and commands wait.
 
 import asyncio
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final
 
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
-from bufgym_live.relay.held import Held, Settled, StoredSession
+from bufgym_live.relay.held import Held
+from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
+from bufgym_live.relay.stored import Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
+
+NOT_REACHED: Final = "not reached: its robot was away until the deadline"
 
 
 class Store:
@@ -144,18 +149,24 @@ class Store:
             self.disk.later(self._held.want_no_more, session, id)
 
     async def hold(
-        self, sender: StoredSession, seq: int, topic: str, frame: bytes, receivers: Sequence[StoredSession]
+        self,
+        sender: StoredSession,
+        seq: int,
+        topic: str,
+        frame: bytes,
+        receivers: Sequence[StoredSession],
+        until_us: int = 0,
     ) -> bool:
         """Store the sender's message number ``seq`` on disk for these receivers; return whether it is new.
 
-        Without receivers, whom other relays have, the number alone is taken.
+        Without receivers, whom other relays have, the number alone is taken. ``until_us`` is its deadline, or 0.
 
         Raises RefusedError: there is no room; then its number is not used.
         """
         for session in (sender, *receivers):
             session.kept = True
         # ``kept`` is set before the wait: a session that leaves meanwhile must not be forgotten with its message.
-        new: bool = await self.disk.do(self._held.hold, sender, seq, topic, frame, receivers)
+        new: bool = await self.disk.do(self._held.hold, sender, seq, topic, frame, receivers, until_us)
         return new
 
     async def make_room(self, size_bytes: int, receivers: Sequence[StoredSession]) -> None:
@@ -166,22 +177,31 @@ class Store:
         """Find number, topic and frame of the session's next message; with no frame, none is left up to the number."""
         return self.disk.do(self._held.next, session, after)
 
-    def acked(self, session: StoredSession, number: int) -> None:
-        """Note that the session has processed all messages up to this number."""
+    def acked(self, session: StoredSession, number: int, why: str = "") -> None:
+        """Note that the session has processed all messages up to this number, and ``why`` it refused the last."""
+        if why:
+            session.answers[number] = why
         session.acked = max(session.acked, number)
         if session.held > 0 and not session.settling:
             session.settling = True
             self.disk.later(self._held.settle_acked, session)
 
-    def denied(self, session: StoredSession, number: int) -> None:
-        """Drop a message that no rule lets the session have any more."""
-        self.disk.later(self._held.deny, session, number)
+    def denied(self, session: StoredSession, number: int, why: str) -> None:
+        """Drop a message that the session must not have any more."""
+        self.disk.later(self._held.deny, session, number, why)
 
-    def tick(self) -> None:
-        """Forget the sessions that have been away for too long, counted while the relay runs."""
+    def waits(self, sender: StoredSession, seq: int) -> asyncio.Future[bool]:
+        """Whether a message of this sender is still held."""
+        return self.disk.do(self._held.waits, sender, seq)
+
+    def tick(self, now_us: int) -> None:
+        """Forget the sessions that have been away for too long, counted while the relay runs, and what is too late."""
         if self.disk.idle:
             self.disk.soon(0, self._held.look)
+            if any(session.held for session in self.sessions.values()):
+                self.disk.soon(0, self._held.expire, now_us, NOT_REACHED)
         for session in list(self.sessions.values()):
+            self.acked(session, session.acked)  # what could not be written before
             if session.unused_s < self._clock() - self.limits.keep_s:
                 self._expire(session)
 
@@ -194,16 +214,24 @@ class Store:
 
         For the start alone, before the disk has its thread.
         """
-        return self._held.robots()
+        return self._held.facts.robots()
 
     def keep_robots(self, rows: Sequence[tuple[str, int, str]], most: int) -> None:
         """Keep these for later, as ``robots`` returns them, and of all only the ``most`` that were here last."""
         if rows:
-            self.disk.soon(sum(len(said) for _, _, said in rows), self._held.keep_robots, rows, most)
+            self.disk.soon(sum(len(said) for _, _, said in rows), self._held.facts.keep_robots, rows, most)
 
     def forget_robot(self, name: str) -> None:
         """Remove a robot that was here."""
-        self.disk.soon(0, self._held.forget_robot, name)
+        self.disk.soon(0, self._held.facts.forget_robot, name)
+
+    def stops(self) -> Iterator[tuple[str, Stop]]:
+        """Read the robots' stops; for the start alone."""
+        return self._held.facts.stops()
+
+    def keep_stops(self, robot: str, stops: Sequence[Stop]) -> asyncio.Future[None]:
+        """Write a robot's stops; the future raises RefusedError if the disk cannot be written."""
+        return self.disk.do(self._held.facts.keep_stops, robot, tuple(stops))
 
     def close(self) -> None:
         """Close the file, when all is written."""

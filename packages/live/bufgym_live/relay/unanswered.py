@@ -1,5 +1,7 @@
 """A client's unanswered no_drop messages: numbered, held until the relay answers, renumbered if refused.
 
+A command to a robot is open after that until the relay says what became of it.
+
 The relay takes number k only after k - 1, and answers each once, in order. A refused number stays unused. So once all
 messages under way are answered, the messages behind the refused one are sent again from that number on.
 """
@@ -42,6 +44,8 @@ class Unanswered:
         self.window = 1  # n_T, the most messages unanswered at a time
         self._waiting: deque[Pending] = deque()
         self._sent: deque[Pending] = deque()
+        self._open: dict[int, Pending] = {}
+        """Number -> command that the relay holds, and of which the robot has not said how it went."""
         self._again: list[Pending] = []
         self._refused = 0  # refusals since the last ack, while more are to come
         self._check: Callable[[wire.Message], object] = lambda message: None
@@ -49,10 +53,15 @@ class Unanswered:
     @property
     def awaited(self) -> bool:
         """Whether an answer is to come."""
-        return bool(self._waiting or self._sent)
+        return bool(self._waiting or self._sent or self._open)
+
+    @property
+    def open(self) -> list[int]:
+        """Numbers of the messages that the relay may hold, or have held."""
+        return [*self._open, *range(self.acked + 1, self.acked + 1 + len(self._sent))]
 
     def put(self, message: wire.Message) -> asyncio.Future[None]:
-        """Add a message; the future is done once the relay holds it."""
+        """Add a message; the future is done once the relay holds it, or the robot has executed it."""
         pending = Pending(message, asyncio.get_running_loop().create_future(), self._clock())
         self._waiting.append(pending)
         return pending.answered
@@ -79,7 +88,17 @@ class Unanswered:
         """Note that the relay holds this message and all before it."""
         while self._sent and self.acked < seq and not self._refused:
             self.acked += 1
-            _settle(self._sent.popleft())
+            pending = self._sent.popleft()
+            if robot_of(pending.message.topic):
+                self._open[self.acked] = pending
+            else:
+                _settle(pending)
+
+    def delivered(self, seq: int, why: str) -> None:
+        """Note what became of a message: executed, or ``why`` not."""
+        self.ack(seq)
+        if (pending := self._open.pop(seq, None)) is not None:
+            _settle(pending, BufgymError(f"topic {pending.message.topic}: {why}") if why else None)
 
     def expects(self, topic: str, seq: int | None) -> bool:
         """Whether the next answer is about this message."""
@@ -119,14 +138,14 @@ class Unanswered:
 
     def withdraw(self, robot: str, why: str) -> None:
         """Withdraw the commands to a robot: none is sent from now on, and those that wait have failed."""
-        for pending in (*self._again, *self._sent, *self._waiting):
+        for pending in (*self._open.values(), *self._again, *self._sent, *self._waiting):
             if robot_of(pending.message.topic) == robot:
                 pending.withdrawn = True
                 _settle(pending, BufgymError(f"topic {pending.message.topic}: {why}"))
 
     def give_up(self, why: str) -> None:
         """Fail all messages, because no answer will come."""
-        for pending in (*self._again, *self._sent, *self._waiting):
+        for pending in (*self._open.values(), *self._again, *self._sent, *self._waiting):
             _settle(pending, BufgymError(why))
 
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from bufgym_live.relay.patterns import for_client
 from bufgym_live.relay.wire import Message
 
-OnMessage = Callable[[Message], Awaitable[None] | None]
+OnMessage = Callable[[Message], Awaitable[str | None] | str | None]
+"""A program's function; of a command it may return why it was not executed."""
 
 
 class SubscriptionRequest(NamedTuple):
@@ -43,21 +44,22 @@ class Wanted:
         """Whether the relay has accepted all that it was asked for."""
         return self.confirmed.issuperset(one.fields["id"] for one in self.asked(stands_in))
 
-    async def call(self, message: Message) -> None:
-        """Call the functions of all subscriptions that a message matches."""
-        for one in list(self._requests.values()):
-            if one.pattern.search(message.topic):
-                await _called(one.on_message, message)
+    async def call(self, message: Message) -> str:
+        """Call the functions of all subscriptions that a message matches; return why one did not execute it."""
+        takers = [one for one in self._requests.values() if one.pattern.search(message.topic)]
+        whys = [await _called(one.on_message, message) for one in takers]
+        return next(filter(None, whys), "") if takers else "nothing here takes it"
 
 
-async def _called(on_message: OnMessage, message: Message) -> None:
+async def _called(on_message: OnMessage, message: Message) -> str:
     """Call a program's function; its fault, which nothing here fixes, goes to the event loop."""
     try:
         done = on_message(message)
-        if inspect.isawaitable(done):
-            await done
+        why = await done if inspect.isawaitable(done) else done
+        return why if isinstance(why, str) else ""
     except (Exception, asyncio.CancelledError) as error:
         if asyncio.current_task().cancelling():  # type: ignore[union-attr]
             raise
         about = {"message": f"on_message of {message.topic}", "exception": error}
         asyncio.get_running_loop().call_exception_handler(about)
+        return f"{type(error).__name__}: {error}"

@@ -29,14 +29,18 @@ VERSION: Final = 1
 MESSAGE: Final = 1  # The one kind of binary frame
 NO_DROP: Final = 1  # A flag
 TIMES: Final = 2  # A flag: two times by the relay's clock follow the header
+ORDER: Final = 4  # A flag: a command's number and the stops that the relay knew follow
 MAX_NAME_BYTES: Final = 255  # Of a topic, a type, an encoding, a sender
 MAX_SEQ: Final = 2**53  # Numbers are exact in JavaScript up to this
 MAX_STAMP_US: Final = 2**53
+MAX_SEEN: Final = 2**14  # Characters of the stops that a command names
 
 _HEADER: Final = struct.Struct("!2s7B3sIQq")
 """Magic; version, kind, flags, bytes of topic, type, encoding and sender; zeros; bytes of the payload; seq; stamp."""
 HEADER_BYTES: Final = _HEADER.size
 _TIMES: Final = struct.Struct("!QQ")
+_ORDER: Final = struct.Struct("!QH")
+"""The command's number; bytes of the stops."""
 _MAGIC: Final = b"bR"
 
 
@@ -72,6 +76,10 @@ class Message(NamedTuple):
     """When the relay took it, us by the relay's clock. The relay fills it in."""
     until_us: int = 0
     """Deadline, us by the relay's clock: later it is not executed. 0: none."""
+    number: int = 0
+    """A command's own number, the same however often it is sent; 0 of all else. The relay fills it in."""
+    seen: str = ""
+    """The robot's stops that the relay knew when it took a command, as ``Ledger.seen``. The relay fills it in."""
 
 
 def encode(message: Message) -> bytes:
@@ -80,9 +88,11 @@ def encode(message: Message) -> bytes:
     names = [name.encode() for name in (message.topic, message.type, message.encoding, message.sender)]
     numbers = len(message.payload), message.seq, message.stamp_us
     times = _TIMES.pack(message.at_us, message.until_us) if message.at_us or message.until_us else b""
-    flags = NO_DROP * message.no_drop | TIMES * bool(times)
+    seen = message.seen.encode()
+    order = _ORDER.pack(message.number, len(seen)) + seen if message.number or seen else b""
+    flags = NO_DROP * message.no_drop | TIMES * bool(times) | ORDER * bool(order)
     header = _HEADER.pack(_MAGIC, VERSION, MESSAGE, flags, *map(len, names), b"\0\0\0", *numbers)
-    return b"".join((header, times, *names, message.payload))
+    return b"".join((header, times, order, *names, message.payload))
 
 
 def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
@@ -93,14 +103,20 @@ def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
     if not HEADER_BYTES <= len(data) <= max_bytes:
         raise WireError(f"frame of {len(data)} bytes: must be from {HEADER_BYTES} to {max_bytes}")
     magic, version, kind, flags, *lengths, zeros, payload_bytes, seq, stamp_us = _HEADER.unpack_from(data)
-    if (magic, version, kind, zeros) != (_MAGIC, VERSION, MESSAGE, b"\0\0\0") or flags > NO_DROP | TIMES:
+    if (magic, version, kind, zeros) != (_MAGIC, VERSION, MESSAGE, b"\0\0\0") or flags > NO_DROP | TIMES | ORDER:
         raise WireError(f"header {data[:12]!r}: must be {_MAGIC!r}, version {VERSION}, kind {MESSAGE}, a known flag")
-    names, at, at_us, until_us = [], HEADER_BYTES, 0, 0
+    names, at, at_us, until_us, number, seen = [], HEADER_BYTES, 0, 0, 0, ""
+    least = at + _TIMES.size * bool(flags & TIMES) + _ORDER.size * bool(flags & ORDER)
+    if len(data) < least:
+        raise WireError(f"frame of {len(data)} bytes: must be at least {least}, as its header says")
     if flags & TIMES:
-        if len(data) < at + _TIMES.size:
-            raise WireError(f"frame of {len(data)} bytes: must be at least {at + _TIMES.size}, as its header says")
         at_us, until_us = _TIMES.unpack_from(data, at)
         at += _TIMES.size
+    if flags & ORDER:
+        number, seen_bytes = _ORDER.unpack_from(data, at)
+        at += _ORDER.size
+        seen = bytes(data[at : at + seen_bytes]).decode(errors="replace")
+        at += seen_bytes
     for length in lengths:
         try:
             names.append(data[at : at + length].decode())
@@ -111,7 +127,9 @@ def decode(data: bytes, max_bytes: int = MAX_FRAME_BYTES) -> Message:
         raise WireError(f"frame of {len(data)} bytes: must be {at + payload_bytes}, as its header says")
     topic, kind_name, encoding, sender = names
     payload, no_drop = memoryview(data)[at:], bool(flags & NO_DROP)
-    message = Message(topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop, at_us, until_us)
+    message = Message(
+        topic, payload, encoding, kind_name, sender, seq, stamp_us, no_drop, at_us, until_us, number, seen
+    )
     _check(message)
     return message
 
@@ -128,6 +146,8 @@ def _check(message: Message) -> None:
         raise WireError(f"stamp_us = {message.stamp_us}: must be at most {MAX_STAMP_US}")
     if not 0 <= message.at_us <= MAX_STAMP_US or not 0 <= message.until_us <= MAX_STAMP_US:
         raise WireError(f"at_us = {message.at_us}, until_us = {message.until_us}: must be from 0 to {MAX_STAMP_US}")
+    if not 0 <= message.number <= MAX_SEQ or len(message.seen) > MAX_SEEN:
+        raise WireError(f"number = {message.number}: must be from 0 to {MAX_SEQ}, with at most {MAX_SEEN} of stops")
 
 
 def check_topic(topic: str) -> None:
@@ -162,8 +182,10 @@ _MESSAGE: Final = {
 FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "hello": {
         "version": Number,
-        **dict.fromkeys(("name?", "session?", "token?", "form?"), str),
+        **dict.fromkeys(("name?", "session?", "robot?", "token?", "form?"), str),
         **dict.fromkeys(("received?", "acked?"), Number),
+        "open?": list[Number],
+        "whys?": dict[str, str],
     },
     "welcome": {
         "version": Number,
@@ -187,12 +209,12 @@ FIELDS: Final[Mapping[str, Mapping[str, Any]]] = {
     "may": {"topics": list[str]},
     "rights": {"rights": dict[str, Any]},
     "publish": {**_MESSAGE, "data": msgspec.Raw},
-    "message": {**_MESSAGE, "sender": str, "at_us?": Number},
-    "ack": {"seq": Number},
+    "message": {**_MESSAGE, "sender": str, "at_us?": Number, "number?": Number, "seen?": str},
+    "ack": {"seq": Number, "why?": str},
     "recordings": {"files?": list[Any]},
     "replay": {"id": str, "file": str, "from_us": Number, "most_bytes": Number},
     "replayed": {"id": str, "messages": list[Any]},
-    "delivered": {"seq": Number, "receivers": Number, "lost": Number},
+    "delivered": {"seq": Number, "receivers": Number, "lost": Number, "why?": str},
     "stopped": {"topic": str, "id": str},
     "refused": {"what": str, "code": str, "why": str},
 }
@@ -259,7 +281,7 @@ def heard(text: str, most_characters: int = MAX_FRAME_BYTES) -> dict[str, Any]:
 
 def to_json(message: Message) -> str:
     """The message as a text frame from the relay, which has seen that JSON is JSON."""
-    fields = message._asdict()
+    fields = {name: value for name, value in message._asdict().items() if value or name not in ("number", "seen")}
     del fields["payload"]
     if message.encoding != "json":
         return say("message", **fields, data=base64.b64encode(message.payload).decode())

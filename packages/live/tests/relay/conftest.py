@@ -1,6 +1,7 @@
 """One relay for each module of tests, and for each test a corner of it that no other test uses."""
 
 import itertools
+import os
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -24,6 +25,12 @@ def _compiled() -> None:
 
     for name in settings().policies:
         policies.warm(name)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _state(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Robots keep their stops in a folder of the tests' own."""
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
 
 
 @pytest.fixture(scope="module")

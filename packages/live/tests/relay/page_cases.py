@@ -13,6 +13,7 @@ from relay_cases import ALL, Client, client, relay, settings
 
 from bufgym.traces.formats.bag_poses import typestore
 from bufgym_live.relay.config import Limits
+from bufgym_live.relay.patterns import escaped
 
 STORE = typestore("cdr")
 made = functools.partial(ros_cases.made, STORE)
@@ -112,13 +113,18 @@ class Fleet:
         async with relay(self.settings) as server, client(server.port, **self.hello) as one:
             self.port = server.port
             self.ready.set()
-            await one.subscribe("^/robots/[^/]+/(command|drive)$")
+            known = set[str]()
             while not self.over.is_set():
                 for name, (status, topics) in list(self.robots.items()):
+                    if name not in known:
+                        known.add(name)
+                        await one.say("subscribe", id=name, topic=f"^/robots/{escaped(name)}/(command|drive)$")
                     await self.publish(one, name, status, topics)
                 for topic, type, payload in self.released:
                     await one.put(topic, payload, type=type, encoding="robofleet")
                 for said in await one.rest():
+                    if isinstance(said, dict):
+                        continue
                     command = json.loads(bytes(said.payload))
                     if said.topic.endswith("/drive"):
                         self.driven.append(command)

@@ -90,7 +90,7 @@ async def test_a_deleted_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("bufgym_live.relay.recorder.PAUSE_S", 0.0)
     async with relay(settings(folder=tmp_path / "relay", rules=(ALL, RECORD))) as server:
         async with client(server.port) as robot, client(server.port) as viewer:
-            await viewer.subscribe("command$")
+            await viewer.subscribe("^/robots/a/command$")
             await robot.put("/robots/a/camera")
             await robot.acked("/robots/a/command", 1)
             await until("all to be written", lambda: all(disk.idle for disk in server.hub.disks))

@@ -98,7 +98,7 @@ async def test_commands_outlive_the_loss_of_the_stream(tmp_path: Path) -> None:
             shared(port, "b", folder=tmp_path / "b") as b,
             client(b.port, session="robot") as one,
         ):
-            await one.subscribe("^/robots/", durable=True)
+            await one.subscribe("^/robots/a/", durable=True)
             await until("a to know b", lambda: a.hub.peers._known == {"a", "b"})
         await alone(a)
         async with nats_server(port, tmp_path / "2"):
@@ -138,7 +138,7 @@ async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monk
         shared(port, "b") as b,
         client(b.port) as one,
     ):
-        await one.subscribe("^/robots/")
+        await one.subscribe("^/robots/a/")
         async with client(a.port, session="operator") as operator:
             await still(server)
             await operator.command(1, command, stamp_us=1)

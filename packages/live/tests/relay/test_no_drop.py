@@ -180,14 +180,14 @@ async def test_only_time_of_a_running_relay_makes_it_forget(tmp_path: Path, monk
     year_s = time.time() + 366 * 86_400
     monkeypatch.setattr("time.time", lambda: year_s)
     now_s += 99
-    store.tick()
+    store.tick(0)
     store.close()
     store, now_s = opened(), now_s + 99
     store.open("here", Identity("1.1.1.1"), False, 0, 0)
-    store.tick()
+    store.tick(0)
     assert len(store.sessions) == 2
     now_s += 2
-    store.tick()
+    store.tick(0)
     assert list(store.sessions) == [("1.1.1.1", "here")]
     store.close()
 
@@ -198,7 +198,7 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
         async with client(server.port, local="127.0.0.2") as operator:
             for k in range(2):
                 async with client(server.port, session=f"dead-{k}") as robot:
-                    await robot.subscribe("command$", durable=True)
+                    await robot.subscribe("^/robots/a/command$", durable=True)
                 await until("its end", lambda: len(server.hub.members) == 1)
                 if k == 0:
                     await operator.acked(COMMAND, 1)
@@ -266,7 +266,7 @@ async def test_a_right_that_was_withdrawn(tmp_path: Path) -> None:
     """What is held for a session that may not receive it any more is not sent, and its sender is told."""
     async with relay(settings(folder=tmp_path)) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
-            await robot.subscribe("command$", durable=True)
+            await robot.subscribe("^/robots/a/command$", durable=True)
         await operator.acked(COMMAND, 1)
     rules = (Rule(address="127.0.0.1", send=True), Rule(address="127.0.0.1", receive=True, topic="/other"))
     async with (
@@ -296,7 +296,7 @@ async def test_what_is_acked_is_on_the_disk(tmp_path: Path) -> None:
     """A kill leaves the files as they are at that moment: another relay goes on from a copy of them."""
     async with relay(settings(folder=tmp_path / "killed")) as server, client(server.port, session="o") as operator:
         async with client(server.port, session="a") as robot:
-            await robot.subscribe("command$", durable=True)
+            await robot.subscribe("^/robots/a/command$", durable=True)
         await operator.acked(COMMAND, 1, 2)
         shutil.copytree(tmp_path / "killed", tmp_path / "next")
     async with (
@@ -315,7 +315,7 @@ async def test_exactly_once_though_the_relay_is_killed(tmp_path: Path, monkeypat
     port, uniform, took, back_s = free_port("127.0.0.1"), random.Random(0), list[list[int]](), list[float]()
     url = f"ws://127.0.0.1:{port}"
     receiver = Session(url, "robot")
-    receiver.subscribe("command$", lambda one: took.append(json.loads(bytes(one.payload))), durable=True)
+    receiver.subscribe("^/robots/a/command$", lambda one: took.append(json.loads(bytes(one.payload))), durable=True)
     senders, acked = [Session(url, f"operator-{k}") for k in range(2)], set[tuple[int, int]]()
 
     async def send(k: int, first: int) -> None:

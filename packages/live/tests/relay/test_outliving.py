@@ -115,7 +115,7 @@ async def test_what_is_too_large_is_refused_by_its_size(corner: Corner) -> None:
     camera, came = corner.topic("camera"), list[Message]()
     async with relay(settings(limits=Limits(message_bytes=1_000))) as server:
         robot, viewer = (RobotClient(f"ws://127.0.0.1:{server.port}", name, topics=(Topic(camera),)) for name in "ab")
-        viewer.subscribe("^/robots/", came.append)
+        viewer.subscribe(f"^/robots/{corner.robot}/", came.append)
         robot.publish(camera, bytes(1_000), "jpeg")
         early = [asyncio.ensure_future(robot.command(corner.command, text)) for text in ("a" * 1_000, "stop")]
         async with beside(viewer.run()) as running:
@@ -205,8 +205,10 @@ async def test_what_a_message_calls_may_wait_for_an_answer(corner: Corner, monke
         answers += 1
 
     one.subscribe(f"^{corner.topic('report')}$", answer, policy="drop-oldest", capacity=100)
-    async with beside(one.run()), corner.client() as robot:
-        await robot.subscribe(f"^{corner.command}$")
+    taker = Session(corner.url, "b", robot=corner.robot)
+    taker.subscribe(f"^{corner.command}$", lambda message: None)
+    async with beside(one.run(), taker.run()), corner.client() as robot:
+        await wait("the robot", taker.ready.wait())
         await wait("its subscription", one.ready.wait())
         held, hold = asyncio.Event(), corner.hub.hold
 

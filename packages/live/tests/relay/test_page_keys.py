@@ -56,9 +56,8 @@ class Yard(Fleet):
                         self.velocities.append(said)
                         continue
                     self.stops.append(time.monotonic())
-                    id = json.loads(bytes(said.payload))["id"]
                     for status, _ in self.robots.values():
-                        status["answer"] = {"id": id, "why": ""}
+                        status["stops"] = json.loads(bytes(said.payload))["stops"]
 
 
 @pytest.fixture(scope="module")

@@ -66,6 +66,7 @@ async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[S
             await one.came(1)
             await one.say("ack", seq=1)
             assert await nothing(one)
+            assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0}
         await operator.acked(command, 2)  # the robot is away: its relay holds it
         assert a.hub.store.held_bytes == 0
 
@@ -90,7 +91,7 @@ async def test_a_command_too_large_for_nats_is_refused_and_the_next_goes_on(rela
         await operator.put(command, bytes(2**20), seq=1, no_drop=True)
         refused = await operator.next()
         assert (refused["op"], refused["code"], refused["seq"]) == ("refused", "too_large", 1)
-        frame_bytes = 32 + len(command) + len("raw") + len("127.0.0.1") + 2**20
+        frame_bytes = 32 + 10 + len(command) + len("raw") + len("127.0.0.1") + 2**20
         assert refused["why"] == f"topic {command}: {frame_bytes} bytes: must be at most 1048320 for NATS"
         await operator.put(f"{robot}/odom", bytes(2**20))  # any other is dropped, and ends no connection either
         await operator.acked(command, 1)

@@ -18,12 +18,12 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff, protocol, wire
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.config import Config, Limits, Rule
-from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.patterns import for_client, pattern
 from bufgym_live.relay.protocol import check_json
 from bufgym_live.relay.quota import Quota, Quotas
 from bufgym_live.relay.rules import Identity, Permissions
 from bufgym_live.relay.session import Session
+from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.wire import Message, RefusedError, WireError
 
 
@@ -67,8 +67,9 @@ def test_a_hello_that_is_refused() -> None:
 def test_who_is_let_in_and_welcomed() -> None:
     said = protocol.hello(wire.say("hello", version=1, session="a", received=3, acked=2))
     admitted = protocol.admit(said, ANNA, RULES, "fresh")
-    assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2)
-    assert protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")[1:] == ("n", "fresh", True, "json", 0, 0)
+    assert admitted[1:] == ("anna@x.org", "a", False, "binary", 3, 2, "", (), {})
+    plain = protocol.admit({"name": "n", "form": "json"}, ANNA, RULES, "fresh")
+    assert plain[1:] == ("n", "fresh", True, "json", 0, 0, "", (), {})
     welcome = protocol.welcome(CONFIG, admitted, ANNA, 5, 7)
     assert wire.heard(wire.say("welcome", **welcome))["received"] == 5 and welcome["session"] == "a"
     assert welcome["rules"] == [{"send": True, "receive": True, "topic": "/open/.*", "command_s": 3.0}]
@@ -168,6 +169,8 @@ messages = st.builds(
     st.booleans(),
     whole,
     whole,
+    whole,
+    names,
 )
 
 
@@ -191,7 +194,7 @@ def published(text: str) -> Message:
 @given(messages)
 def test_what_is_written_is_read(message: Message) -> None:
     assert wire.decode(wire.encode(message)) == message
-    assert published(wire.to_json(message)) == message._replace(sender="", at_us=0)
+    assert published(wire.to_json(message)) == message._replace(sender="", at_us=0, number=0, seen="")
 
 
 @pytest.mark.parametrize("payload", NO_JSON, ids=len)
@@ -222,7 +225,7 @@ TWO = {2: "version 1", 3: "kind 1", 4: "frame of 40 bytes: must be at least 48"}
         (wire.decode, GOOD + b"1", "frame of 41 bytes: must be 40"),
         *((wire.decode, data, "header") for data in (b"bX" + GOOD[2:], GOOD[:9] + b"\x01" + GOOD[10:])),
         *((wire.decode, GOOD[:k] + b"\x02" + GOOD[k + 1 :], says) for k, says in TWO.items()),
-        (wire.decode, GOOD[:4] + b"\x04" + GOOD[5:], "a known flag"),
+        (wire.decode, GOOD[:4] + b"\x08" + GOOD[5:], "a known flag"),
         (wire.decode, GOOD[:16] + b"\xff" * 8 + GOOD[24:], "seq"),
         (wire.decode, GOOD[:24] + b"\x7f" + GOOD[25:], "stamp_us"),
         (wire.decode, GOOD.replace(b"/a", b"aa"), "must begin with '/'"),

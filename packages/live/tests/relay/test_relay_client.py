@@ -197,7 +197,7 @@ async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> Non
         await viewer.subscribe("camera")
         async with within("both relays"), beside(robot.run()):
             async with relay(ours), client(ours.port, session="receiver") as receiver:
-                await receiver.subscribe("/robots/other/command", durable=True)
+                await receiver.subscribe("^/robots/other/command$", durable=True)
                 await until("home", lambda: robot.ready.is_set() and not robot.stands_in)
             await until("the other", lambda: robot.ready.is_set() and robot.stands_in)
             robot.publish(camera, b"picture", "raw")
@@ -209,10 +209,12 @@ async def test_another_relay_stands_in_while_home_is_away(tmp_path: Path) -> Non
             waiting = asyncio.ensure_future(robot.command("/robots/other/command", 7))
             async with relay(ours), client(ours.port) as operator:
                 await operator.acked(command, 1)
-                await waiting
                 await until("the command", lambda: commands)
                 async with client(ours.port, session="receiver") as receiver:
                     await receiver.came(1, payload=b"7")
+                    assert not waiting.done()
+                    await receiver.say("ack", seq=1)
+                    await wait("its receipt", waiting)
                     assert not [one for one in await receiver.rest() if isinstance(one, Message)]
     assert commands == [1]
 

@@ -110,8 +110,8 @@ async def test_released_clients_meet() -> None:
         assert bytes((await ours.next()).payload) == STATUS
         # On a no_drop topic the relay holds it for ours, which acks. (And this comes next to the page, not a status.)
         command = flat("std_msgs/String", "/robots/a/command", "go")
-        await ours.subscribe("command$", id="c")
-        await page.send(wants("command$"))
+        await ours.subscribe("^/robots/a/command$", id="c")
+        await page.send(wants("^/robots/a/command$"))
         await wanted(server, 3)
         await robot.send(command)
         message = await ours.next()

@@ -24,13 +24,13 @@ from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import policies
 from bufgym_live.relay.config import Config, Foxglove, Limits, Rotation, Rule, load
-from bufgym_live.relay.held import StoredSession
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import MAX_CHARACTERS, pattern
 from bufgym_live.relay.plain import Latest
 from bufgym_live.relay.quota import Bucket, Quotas
 from bufgym_live.relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
+from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.subscriber import Subscription, next_lane
 from bufgym_live.relay.wire import Message, RefusedError
 from bufgym_live.robot.queue import PolicyQueue

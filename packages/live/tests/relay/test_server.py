@@ -53,7 +53,7 @@ async def test_the_last_message_of_a_latched_topic_comes_to_who_subscribes_later
     corner: Corner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only so many bytes are kept: two messages of 20 bytes, each with a header of 32, are more than 100."""
-    monkeypatch.setattr("bufgym_live.relay.hub.MAX_LATCHED_BYTES", 100)
+    monkeypatch.setattr("bufgym_live.relay.last.MAX_BYTES", 100)
     async with corner.client() as robot, corner.client() as viewer:
         for topic, text in (("a/map", b"1"), ("map", b"2"), ("map", b"3" * 20), ("maps", b"4")):
             await robot.put(corner.topic(topic), text)

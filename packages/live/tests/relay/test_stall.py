@@ -26,7 +26,7 @@ COMMAND, PICTURE = "/robots/a/command", "/robots/a/camera"
 @pytest.fixture
 def go(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
     """While it is cleared, no transaction of a store ends, nor a write of an audit log."""
-    goes, transaction, write = threading.Event(), Held._transaction, _Lines.write
+    goes, transaction, write = threading.Event(), Held.transaction, _Lines.write
 
     @contextlib.contextmanager
     def stalling(held: Held, **how: bool) -> Iterator[None]:
@@ -38,7 +38,7 @@ def go(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
         assert goes.wait(60.0)
         write(lines, text)
 
-    monkeypatch.setattr(Held, "_transaction", stalling)
+    monkeypatch.setattr(Held, "transaction", stalling)
     monkeypatch.setattr(_Lines, "write", writing)
     monkeypatch.setattr(disk, "STALL_S", 0.05)
     monkeypatch.setattr("bufgym_live.relay.server.TICK_S", 0.01)

@@ -17,6 +17,7 @@ from bufgym_live.relay import backoff
 from bufgym_live.relay.clock import RelayClock
 from bufgym_live.relay.config import Rule
 from bufgym_live.relay.drive import STILL, Drive, Velocity
+from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.orders import Orders, moves
 from bufgym_live.relay.robot import Robot
 from bufgym_live.relay.ros import Ros1
@@ -52,39 +53,44 @@ def test_deadlines_by_hand() -> None:
     """3 s from when the relay took it, or what its sender says, if that is less."""
     orders = Orders()
     goal = {"command": "goal", "id": "1"}
-    assert orders.dated(said(goal, 1_000_000), 3.0, 1_000_000, "ann").until_us == 4_000_000
-    assert orders.dated(said(goal, 1_000_000, 2_500_000), 3.0, 1_000_000, "ann").until_us == 2_500_000
-    assert orders.dated(said(goal, 1_000_000, 9_000_000), 3.0, 1_000_000, "ann").until_us == 4_000_000
+    assert orders.dated(said(goal, 1_000_000), 3.0, 1_000_000).until_us == 4_000_000
+    assert orders.dated(said(goal, 1_000_000, 2_500_000), 3.0, 1_000_000).until_us == 2_500_000
+    assert orders.dated(said(goal, 1_000_000, 9_000_000), 3.0, 1_000_000).until_us == 4_000_000
     with pytest.raises(RefusedError, match=r"0\.5 s after its deadline"):
-        orders.dated(said(goal, 1_000_000, 500_000), 3.0, 1_000_000, "ann")
+        orders.dated(said(goal, 1_000_000, 500_000), 3.0, 1_000_000)
     with pytest.raises(RefusedError, match="waited longer than the 3 s"):  # for the disk
-        orders.dated(said(goal, 1_000_000), 3.0, 4_000_001, "ann")
+        orders.dated(said(goal, 1_000_000), 3.0, 4_000_001)
     late = said(goal, 1_000_000, 4_000_000)
     assert not orders.is_over(late, 4_000_000) and orders.is_over(late, 4_000_001)
     other = said({}, 1_000_000, topic="/robots/r/camera")
-    assert orders.dated(other, 3.0, 9_000_000, "ann") == other and not orders.is_over(other, 9_000_000)
+    assert orders.dated(other, 3.0, 9_000_000) == other and not orders.is_over(other, 9_000_000)
 
 
 def test_a_stop_withdraws_what_the_relay_took_before_it() -> None:
     orders = Orders()
-    goal, stop = {"command": "goal", "id": "1"}, {"command": "stop", "id": "s1"}
-    before = orders.dated(said(goal, 1_000_000), 3.0, 1_000_000, "ann")
-    dated = orders.dated(said(stop, 2_000_000, 1, STOP)._replace(until_us=0), 3.0, 2_000_000, "bob@x.org")
-    assert (json.loads(bytes(dated.payload))["by"], dated.until_us) == ("bob@x.org", 0)
+    goal, stop = {"command": "goal", "id": "1"}, {"command": "stop", "id": "bob-1"}
+    before = orders.dated(said(goal, 1_000_000), 3.0, 1_000_000)
+    new = orders.ordered(said(stop, 2_000_000, topic=STOP), "bob@x.org", "<bob@x.org>")
+    assert new == orders.ledgers["r"].held == [Stop("bob", 1, "bob@x.org", 2_000_000)]
+    assert orders.ordered(said(stop, 2_050_000, topic=STOP), "bob@x.org", "<bob@x.org>") == []
     assert orders.is_over(before, 2_000_000)
     assert not orders.is_over(before._replace(topic="/robots/other/command"), 2_000_000)
     with pytest.raises(RefusedError, match=r"r was stopped by bob@x\.org: release it first"):
-        orders.dated(said(goal, 2_100_000), 3.0, 2_100_000, "ann")
+        orders.dated(said(goal, 2_100_000), 3.0, 2_100_000)
     cancel = said({"command": "cancel"}, 2_100_000)
-    assert orders.dated(cancel, 3.0, 2_100_000, "ann").until_us == 5_100_000
+    assert orders.dated(cancel, 3.0, 2_100_000).until_us == 5_100_000
     with pytest.raises(RefusedError, match=r"stopped again, by bob@x\.org"):
-        orders.dated(said({"command": "release", "id": "x", "of": "s0"}, 2_200_000, topic=STOP), 3.0, 2_200_000, "ann")
-    free = orders.dated(said({"command": "release", "id": "x", "of": "s1"}, 2_300_000, topic=STOP), 3.0, 2_300_000, "a")
-    assert free.until_us == 5_300_000
-    after = orders.dated(said(goal, 2_400_000), 3.0, 2_400_000, "ann")
-    assert not orders.is_over(after, 2_400_000) and orders.is_over(before, 2_400_000)
+        orders.ordered(said({"command": "release", "id": "x", "of": "bob-0"}, 2_200_000, topic=STOP), "ann", "ann")
+    orders.ordered(said({"command": "release", "id": "x", "of": "bob-1"}, 2_300_000, topic=STOP), "ann", "ann")
+    assert orders.ledgers["r"].held == []
+    after = orders.dated(said(goal, 2_400_000), 3.0, 2_400_000)
+    assert (after.seen, orders.is_over(after, 2_400_000), orders.is_over(before, 2_400_000)) == (
+        '{"bob":1}',
+        False,
+        True,
+    )
     with pytest.raises(RefusedError, match=r"topic /robots/r/stop: b'\{.*must be"):
-        orders.dated(said({"command": "goal", "id": "x"}, 1, topic=STOP), 3.0, 1, "ann")
+        orders.ordered(said({"command": "goal", "id": "x"}, 1, topic=STOP), "ann", "ann")
 
 
 def test_what_moves_a_robot() -> None:
@@ -124,6 +130,7 @@ class Program:
 
     def __init__(self) -> None:
         self.done: list[tuple[str, float]] = []
+        self.at_work = False
         self.works = asyncio.Event()
         self.works.set()
 
@@ -135,6 +142,7 @@ class Program:
 
     async def on_command(self, command: Any) -> None:
         if command["command"] == "goal":
+            self.at_work = True
             await self.works.wait()
         self.done.append((command.get("id", command["command"]), time.monotonic()))
 
@@ -234,10 +242,13 @@ async def test_a_goal_whose_deadline_passes_while_it_is_read_is_not_published() 
 async def test_a_stop_does_not_wait_for_a_program_at_work() -> None:
     async with scene() as one:
         one.program.works.clear()
-        assert await one.goal("long") == "" and await one.goal("behind it") == ""
+        goals = [asyncio.ensure_future(one.goal(id)) for id in ("long", "behind it")]
+        await until("it works", lambda: one.program.at_work)
         await wait("the stop", one.operator.stop("r"))
         await until("it stands", lambda: one.program.names == ["stop"])
         one.program.works.set()
+        for goal in goals:
+            assert "withdrawn by a stop" in await wait("the receipt", goal)
         await until("an answer", lambda: "stopped by operator" in one.robot.status()["answer"]["why"])
         assert one.program.names == ["stop"]
 

@@ -77,16 +77,19 @@ async def client(*words: str) -> AsyncIterator[list[str]]:
 
 async def test_a_client_written_from_the_page_alone(corner: Corner) -> None:
     """It publishes, its command is held and arrives; a command that comes while its link is cut reaches it, once."""
-    stop, clock = {"topic": corner.command, "data": "stop"}, corner.topic("clock")
+    other = f"/robots/{corner.robot}-b/command"
+    stop, clock = {"topic": other, "data": "stop"}, corner.topic("clock")
     link = ShapedLink(Link(Trace.constant(1e7, duration_s=10)), ("127.0.0.1", corner.port))
     url = f"ws://127.0.0.1:{await link.listen()}"
     async with within("the client"), corner.client(session="operator") as operator:
         await operator.subscribe(f"^/robots/{corner.robot}/")
-        async with client(url, corner.robot, corner.command, '"stop"') as lines:
+        await operator.subscribe(f"^/robots/{corner.robot}-b/", "b")
+        async with client(url, corner.robot, other, '"stop"') as lines:
             await until("its command to be held", lambda: f"held {json.dumps(stop, separators=(',', ':'))}" in lines)
             came = [one for one in await operator.rest() if isinstance(one, Message)]
             assert [bytes(one.payload) for one in came if one.no_drop] == [b'"stop"']
-            await operator.say("ack", seq=1)
+            await operator.say("ack", seq=1, why="it stands already")
+            await until("what became of it", lambda: "done 1 it stands already" in lines)
             await operator.command(1, corner.command)
             await until("a command", lambda: f"{corner.command} 1" in lines)
             link.cut()

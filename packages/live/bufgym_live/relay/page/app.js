@@ -314,6 +314,15 @@ function redrawn() {
 }
 
 addEventListener("hashchange", show);
+// Chromium sometimes drops the first navigation to a fragment after a load; a step made here is always taken.
+addEventListener("click", event => {
+  const link = event.target instanceof Element ? /** @type {HTMLAnchorElement} */ (event.target.closest('a[href^="#/"]')) : null;
+  if (!link || event.button || event.ctrlKey || event.metaKey || event.shiftKey || event.altKey) return;
+  event.preventDefault();
+  if (location.hash === link.hash) return;
+  history.pushState(null, "", link.hash);
+  show();
+});
 addEventListener("resize", redraw);
 whenColoursChange(redraw);
 show();

@@ -6,6 +6,7 @@ import {layer} from "./drawings.js";
 import {unpacked} from "./flat.js";
 import {Place, within} from "./frames.js";
 import {charge, diagnostics, DRAWN, flag, json, kindOf, queue, scan, status} from "./messages.js";
+import {stopsOf} from "./stops.js";
 
 export const AWAY_MS = 5000, LOW = 0.25;
 export const GONE_MS = 600_000;                     // who was not here for so long needs nobody now
@@ -90,7 +91,7 @@ export class Fleet {
     if (!name || !message) return;
     if (topic === "stop") {                         // a stop says nothing of whether its robot is there
       const known = this.robots.get(name);
-      if (known && json(message)?.command === "stop") this.on.stopped(known);
+      if (known && stopsOf(json(message)?.stops).some(stop => stop.isHeld)) this.on.stopped(known);
       return;
     }
     if (topic === "last") return this.takeLast(name, json(message), message.atMs ?? message.stampMs);

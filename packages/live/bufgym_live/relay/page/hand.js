@@ -5,6 +5,7 @@ import {say, tint} from "./draw.js";
 import {Drive} from "./drive.js";
 import {FAR_M, number} from "./cdr.js";
 import {stamped, still} from "./cdr_write.js";
+import {Stops} from "./stops.js";
 import {Gamepads} from "./gamepad.js";
 import {listen} from "./keys.js";
 
@@ -94,7 +95,8 @@ export class Hand {
     if (!robot || !this.way(robot, "stop")) return;
     if (!robot.status?.commands.includes("release")) return this.send("stop", {}, robot);
     this.take(null);
-    this.sent = {id: this.relay.stop(robot.name), kind: "stop", robot, state: "on its way"};
+    const id = this.relay.stop(robot.name);
+    this.sent = {id, of: [id], kind: "stop", robot, state: "on its way"};
     this.draw();
   }
 
@@ -119,9 +121,9 @@ export class Hand {
 
   release() {
     this.all = null;
-    const robot = this.asks.live(), stop = robot?.status?.stop;
-    if (!stop) return;
-    this.sent = {id: this.relay.release(robot.name, stop.id), kind: "release", robot, state: "on its way"};
+    const robot = this.asks.live();
+    if (!robot || !this.relay.stops.held(robot.name).length) return;
+    this.sent = {id: "", of: this.relay.release(robot.name), kind: "release", robot, state: "on its way"};
     this.draw();
   }
 
@@ -148,15 +150,23 @@ export class Hand {
 
   // A robot's status: it may answer.
   answered(robot) {
-    const {answer: {id, why}, stop} = robot.status, {sent} = this;
-    if (this.relay.stops.has(robot.name) && [id, stop?.id].includes(this.relay.stops.get(robot.name))) this.relay.stops.delete(robot.name);
-    if (this.all?.open.has(robot) && [id, stop?.id].includes(this.all.open.get(robot))) this.all.open.delete(robot);
-    const isPolicy = sent?.kind === "policy" && robot.queue?.policy === this.$("policy").value;
-    if (!sent || sent.doneMs || sent.robot !== robot || (id !== sent.id && stop?.id !== sent.id && !isPolicy)) return;
+    const {answer: {id, why}, stops} = robot.status, {sent} = this;
+    this.relay.stops.heard(robot.name, stops, true);
+    const one = this.all?.open.get(robot);
+    if (one !== undefined && (id === one || Stops.has(stops, one))) this.all?.open.delete(robot);
+    if (!sent || sent.doneMs || sent.robot !== robot || !this.isDone(robot)) return;
     if (why && id === sent.id) this.notices.refused(robot.name, `${sent.kind}: ${why}`, this.asks.nowMs());
     sent.state = why && id === sent.id ? "refused" : "done";
     sent.doneMs = performance.now();
     this.draw();
+  }
+
+  // Whether the robot's status says that the last command is over.
+  isDone(robot) {
+    const {answer: {id}, stops} = robot.status, {sent} = this;
+    if (sent.kind === "stop" && sent.of) return Stops.has(stops, sent.of[0]);
+    if (sent.kind === "release") return sent.of.every(one => Stops.has(stops.filter(stop => !stop.isHeld), one));
+    return id === sent.id || (sent.kind === "policy" && robot.queue?.policy === this.$("policy").value);
   }
 
   // What is offered, and how far the last command is.
@@ -170,8 +180,9 @@ export class Hand {
     this.$("stop-all").hidden = count < 2;
     this.$("stop-all").setAttribute("aria-pressed", isArmed);
     say(this.$("stop-all"), isArmed ? `Stop all ${count}: press again` : `Stop all ${count}`);
-    this.$("release").hidden = !isLive || !robot?.status?.stop || !may;
+    this.$("release").hidden = !isLive || !robot || !this.relay.stops.held(robot.name).length || !may;
     say(this.$("release"), `Release ${robot?.name ?? ""}`);
+    this.$("release").title = robot ? `stopped by ${this.relay.stops.held(robot.name).map(stop => stop.by).join(", ")}` : "";
     for (const kind of ["goal", "pose", "cancel"]) this.$(kind).hidden = !ways[kind] || !isLive;
     this.drive.offer(ways.drive && isLive && !robot.away ? robot : null);
     this.$("remove").hidden = isOff || !robot.away || !this.relay.mayCommand(`/robots/${robot.name}/last`);
@@ -184,7 +195,7 @@ export class Hand {
 
   // Why a stop has not reached its robot yet.
   waits(robot) {
-    if (this.sent.kind === "stop" && this.relay.stops.has(robot.name) && (robot.away || !this.relay.isLive))
+    if (this.sent.kind === "stop" && this.relay.stops.ids(robot.name).length && (robot.away || !this.relay.isLive))
       return `kept: ${robot.name} stops as soon as it can be reached`;
   }
 

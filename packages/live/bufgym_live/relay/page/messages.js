@@ -1,6 +1,7 @@
 // What goes over the wire, and what is in it: the relay's binary frames, and what each kind of message says.
 
 import {Cdr, FAR_M, number, numbers, object} from "./cdr.js";
+import {stopsOf} from "./stops.js";
 
 const text = new TextDecoder();
 const MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS = 1000, MOST_PARTS = 500;
@@ -9,8 +10,9 @@ const MOST_RAYS = 20_000, MOST_SLOTS = 1000, MOST_TOPICS = 64, MOST_TRANSFORMS =
 export function decode(buffer) {
   const view = new DataView(buffer), names = [];
   if (view.getUint16(0) !== 0x6252 || view.getUint8(2) !== 1 || view.getUint8(3) !== 1) throw new Error("no frame of this relay");
-  const isTimed = (view.getUint8(4) & 2) !== 0;
+  const isTimed = (view.getUint8(4) & 2) !== 0, isOrder = (view.getUint8(4) & 4) !== 0;
   let at = isTimed ? 48 : 32;
+  if (isOrder) at += 10 + view.getUint16(at + 8);   // a command's number, and the stops that the relay knew
   for (let k = 0; k < 4; k++) {
     const length = view.getUint8(5 + k);
     names.push(text.decode(new Uint8Array(buffer, at, length)));
@@ -113,11 +115,11 @@ export function queue(said) {
 const texts = said => (Array.isArray(said) ? said : []).slice(0, MOST_TOPICS).map(String);
 
 export function status(said) {
-  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, stop, text, queue: its} = object(said);
+  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, stop, stops, text, queue: its} = object(said);
   return {
     ...numbers(said, "battery"), network: numbers(network, "rtt_ms"), location: place(location), recording: String(recording ?? ""),
     driver: String(driver ?? "").slice(0, 300),
-    stop: stop ? {id: String(object(stop).id ?? ""), by: String(object(stop).by ?? "").slice(0, 100)} : null,
+    stops: stopsOf(stops), stop: stop ? {id: String(object(stop).id ?? ""), by: String(object(stop).by ?? "").slice(0, 100)} : null,
     ok: typeof ok === "boolean" ? ok : undefined, estop: estop === true, text: String(text ?? "").slice(0, 300),
     commands: texts(commands), receives: texts(receives), policies: texts(policies), queue: its && queue(its),
     answer: {id: String(object(answer).id ?? ""), why: String(object(answer).why ?? "").slice(0, 300)},

@@ -1,13 +1,14 @@
 // The connection to the relay: says hello, subscribes, sends commands, and connects again by itself.
 
 import {Clock} from "./clock.js";
-import {decode, fromJson} from "./messages.js";
+import {decode, fromJson, json} from "./messages.js";
 import {Rights} from "./rights.js";
 import {Sleep} from "./sleep.js";
+import {Stops, stopsOf} from "./stops.js";
 
 const FIRST_MS = 200, AWAY_MS = 1000, MOST_MS = 2000, HELD_MS = 5000;  // as in backoff.py, but somebody waits for it
 const ASK_MS = 500, SILENT_MS = 2000, LOST_MS = 6000;  // the relay is asked so often; without an answer for so long it is not live, then given up
-const COMMAND_S = 3, EARLY = 1000;
+const COMMAND_S = 3, EARLY = 1000, STOP = /^\/robots\/([^/]+)\/stop$/;
 
 export class Relay {
   // on: {state(text, isOn), welcome(), rights(), message(message), said(object), unauthorized(why, token), slept(ms)}
@@ -21,13 +22,12 @@ export class Relay {
     this.waits = 0;                                 // timer of the next try
     this.askedMs = null;                            // since when an answer is awaited
     this.isLive = false;
-    this.stops = new Map();                         // robot -> id of a stop that it has not confirmed
-    this.number = 0;
     this.received = 0;                              // the highest no_drop message that came
     this.acked = 0;                                 // and the highest of ours that the relay holds
     this.subscriptions = new Map();
     this.commands = [];                             // not answered yet; the first is on its way
     this.name = "page-" + [...crypto.getRandomValues(new Uint8Array(8))].map(byte => byte.toString(16).padStart(2, "0")).join("");
+    this.stops = new Stops(this.name);
     this.token = sessionStorage.getItem("token");
     const brought = new URLSearchParams(location.hash.slice(1)).get("token");
     if (brought !== null) {                         // kept, but not in an address that somebody may send on
@@ -154,22 +154,19 @@ export class Relay {
 
   // Stop a robot, said on each connection until the robot confirms it. What waits for it is withdrawn.
   stop(robot) {
-    const id = `${this.name}-s${++this.number}`, own = `/robots/${robot}/`;
+    const id = this.stops.say(robot), own = `/robots/${robot}/`;
     for (const command of this.commands) if (command.topic.startsWith(own)) command.failed(new Error("withdrawn by a stop"));
-    this.stops.set(robot, id);
-    if (this.welcome) this.sayStops();
+    if (this.welcome) this.sayStop(id, robot);
     return id;
   }
 
-  sayStops() {
-    for (const [robot, id] of this.stops) this.say("publish", {topic: `/robots/${robot}/stop`, data: {command: "stop", id}});
-  }
+  sayStop(id, robot) { this.say("publish", {topic: `/robots/${robot}/stop`, data: {command: "stop", id}}); }
 
-  release(robot, of) {
-    const id = `${this.name}-s${++this.number}`;
-    this.stops.delete(robot);
-    this.say("publish", {topic: `/robots/${robot}/stop`, data: {command: "release", id, of}, until_us: this.deadline(`/robots/${robot}/command`)});
-    return id;
+  // Release a robot from all stops that anybody holds.
+  release(robot) {
+    const of = this.stops.held(robot).map(stop => stop.id), topic = `/robots/${robot}/stop`;
+    this.say("publish", {topic, data: {command: "release", id: `${this.name}-release`, of}, until_us: this.deadline(`/robots/${robot}/command`)});
+    return of;
   }
 
   // Done when the relay holds it, true; an error says why it does not. What it does not hold goes at once, false.
@@ -209,7 +206,8 @@ export class Relay {
       this.clock.begin(said.clock_us / 1000);
       this.askedMs = null;
       this.isLive = true;
-      this.sayStops();
+      this.stops.begin();
+      for (const [id, robot] of this.stops.waiting) this.sayStop(id, robot);
       this.acked = said.received;
       for (const subscription of this.subscriptions.values()) this.say("subscribe", subscription);
       this.on.state("live", true);
@@ -248,6 +246,8 @@ export class Relay {
   }
 
   take(message) {
+    const stopped = STOP.exec(message.topic);
+    if (stopped) this.stops.heard(stopped[1], stopsOf(json(message)?.stops));
     this.clock.heard(message.atMs);
     if (message.noDrop) {
       if (message.seq <= this.received) return;

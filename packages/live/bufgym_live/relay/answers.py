@@ -1,0 +1,35 @@
+"""Commands that went to other relays: how each ended, which the relay where its robot is says."""
+
+from typing import Final
+
+from bufgym_live.relay import wire
+from bufgym_live.relay.hub import Hub
+from bufgym_live.relay.store import NOT_REACHED
+from bufgym_live.relay.stored import Settled, StoredSession
+
+_GRACE_US: Final = 2_000_000  # time beyond a command's deadline for the answer to come
+
+
+class Answers:
+    """The answers that are awaited."""
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._awaited: dict[int, tuple[StoredSession, int, int]] = {}
+        """Number of a command at NATS -> its sender, the sender's number, its deadline."""
+
+    def await_one(self, number: int, sender: StoredSession, message: wire.Message) -> None:
+        """Await the answer to a command."""
+        self._awaited[number] = sender, message.seq, message.until_us
+
+    def came(self, number: int, lost: int, why: str) -> None:
+        """Tell the sender of a command how it ended."""
+        sender, seq, _ = self._awaited.pop(number, (None, 0, 0))
+        if sender is not None:
+            self._hub.settled(Settled(sender, seq, 1, lost, why))
+
+    def tick(self) -> None:
+        """Give up what is not answered by now: no relay has the robot."""
+        now_us = self._hub.now_us()
+        for number in [one for one, (_, _, until_us) in self._awaited.items() if until_us + _GRACE_US < now_us]:
+            self.came(number, 1, NOT_REACHED)

@@ -1,0 +1,52 @@
+"""A client's session as the relay keeps it, and how a message ended."""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from bufgym_live.relay.patterns import Pattern
+from bufgym_live.relay.rules import Identity
+
+
+@dataclass(eq=False)
+class StoredSession:
+    """A client's session as the relay keeps it, over all its connections."""
+
+    name: str
+    identity: Identity
+    temporary: bool  # whether the session ends with its connection
+    received: int = 0  # highest number of a no_drop message taken from it
+    numbered: int = 0  # highest number of a no_drop message for it
+    held: int = 0  # number of messages for it that are not acked
+    held_bytes: int = 0
+    durable: dict[str, Pattern] = field(default_factory=dict)  # id -> pattern of messages held for it while away
+    away_s: float = math.inf  # beginning of its absence, by the store's clock; infinity while it is here
+    kept: bool = False  # whether the store was asked to remember it
+    orders: int = 0  # number of its orders that wait for the disk
+    id: int | None = None  # id on disk, which only the disk's thread reads
+    acked: int = 0  # highest number that it has acked
+    settling: bool = False  # whether acks wait to be written
+    robot: str = ""  # the robot that it has claimed to be
+    heard_s: float = -math.inf  # when its client said something last, by the relay's clock
+    answers: dict[int, str] = field(default_factory=dict)  # number of a message for it -> why it was refused
+    outcomes: dict[int, "Settled"] = field(default_factory=dict)  # the last messages of it that are settled
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Identity and name; the same name under another identity is another session."""
+        return self.identity.key, self.name
+
+    @property
+    def unused_s(self) -> float:
+        """Time from which on it may be forgotten; infinity while it is here, or an order of it waits."""
+        return math.inf if self.orders else self.away_s
+
+
+class Settled(NamedTuple):
+    """A message that no receiver waits for any more."""
+
+    sender: StoredSession
+    seq: int
+    receivers: int
+    lost: int  # number of receivers that never acked it
+    why: str = ""  # why its receiver refused it, or did not get it
