@@ -16,6 +16,7 @@ from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import Rule
+from bufgym_live.relay.drive import check_speed
 from bufgym_live.relay.orders import is_stop, order, robot_of
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.outgoing import Outgoing
@@ -213,6 +214,7 @@ class Connection:
         try:
             who, no_drop, now_s = self._caller.identity, hub.is_no_drop(message.topic), hub.clock()
             new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
+            check_speed(message, self.permissions.speed(message.topic))
             hub.drivers.note(message.topic, self.session.name, address=who.address, email=who.email)
             if is_last(message.topic):
                 hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
@@ -294,7 +296,7 @@ class Connection:
             self._outbox.wake()
         else:
             subscription.offer(outgoing.message.topic, outgoing, outgoing.size_bytes)
-            self._outbox.offered()
+            self._outbox.offered(outgoing.size_bytes)
 
     def _answer_waits(self) -> None:
         self._outbox.wake()

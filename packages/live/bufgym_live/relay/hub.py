@@ -69,6 +69,7 @@ class Hub:
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
+        self.writing = asyncio.Lock()  # whose turn it is to write a large message
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
         self.turns = Turns()
         self._failed: set[str] = set()
