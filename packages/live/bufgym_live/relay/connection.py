@@ -1,7 +1,6 @@
 """One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
 
 import asyncio
-import hashlib
 import itertools
 import secrets
 import time
@@ -26,7 +25,7 @@ from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.rules import Permissions
-from bufgym_live.relay.stored import StoredSession
+from bufgym_live.relay.stored import StoredSession, command_number
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -220,13 +219,11 @@ class Connection:
                 hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
             at_us = message.at_us or hub.now_us()
             message = message._replace(sender=self._admitted.name, stamp_us=message.stamp_us or at_us, at_us=at_us)
-            number = self._number(message) if message.no_drop and robot_of(message.topic) else 0
+            number = command_number(self.session, message.seq) if message.no_drop and robot_of(message.topic) else 0
             message = message._replace(number=number, seen="")
             message = hub.orders.dated(message, self.permissions.command_s(message.topic), hub.now_us())
             if is_stop(message.topic):
-                hub.holding.begin(
-                    self._confirm(message, hub.desk.order(message, who.email or self._admitted.name, who))
-                )
+                hub.holding.begin(self._confirm(message, hub.desk.order(message, self._shown, who)))
             elif not message.no_drop:
                 hub.publish(self, message)
             elif not new or await self._hold(message):
@@ -234,10 +231,11 @@ class Connection:
         except RefusedError as refused:
             self._refused(refused, message.topic, message.seq, message.no_drop)
 
-    def _number(self, message: wire.Message) -> int:
-        """Give a command's number: the same however often its client sends it."""
-        about = f"{self.session.identity.key}\n{self.session.name}\n{message.seq}".encode()
-        return int.from_bytes(hashlib.blake2b(about, digest_size=6).digest(), "big")
+    @property
+    def _shown(self) -> str:
+        """Who says a stop, as others see it; a name that reads as an e-mail but is not proved says so."""
+        name = self._admitted.name
+        return self._caller.identity.email or (f"{name} (not proved)" if "@" in name else name)
 
     async def _confirm(self, message: wire.Message, kept: asyncio.Future[None]) -> None:
         """Confirm a stop or a release once it is on the disk; until then its client says it again."""

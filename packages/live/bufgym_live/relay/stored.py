@@ -1,5 +1,6 @@
 """A client's session as the relay keeps it, and how a message ended."""
 
+import hashlib
 import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -40,6 +41,12 @@ class StoredSession:
     def unused_s(self) -> float:
         """Time from which on it may be forgotten; infinity while it is here, or an order of it waits."""
         return math.inf if self.orders else self.away_s
+
+
+def command_number(session: StoredSession, seq: int) -> int:
+    """Give a command's number: the same however often its client sends it."""
+    about = f"{session.identity.key}\n{session.name}\n{seq}".encode()
+    return int.from_bytes(hashlib.blake2b(about, digest_size=6).digest(), "big")
 
 
 class Settled(NamedTuple):
