@@ -25,7 +25,7 @@ from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.rules import Permissions
-from bufgym_live.relay.stored import StoredSession
+from bufgym_live.relay.stored import UNKNOWN, StoredSession
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -103,7 +103,7 @@ class Connection:
             if (known := self.session.outcomes.get(seq)) is not None:
                 self._hub.tell_outcome(known)
             elif seq <= self.session.received and not await self._hub.store.waits(self.session, seq):
-                self.tell("delivered", seq=seq, receivers=1, lost=1, why="nobody knows whether it was executed")
+                self.tell("delivered", seq=seq, receivers=1, lost=1, why=UNKNOWN)
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""

@@ -122,7 +122,7 @@ class Robot:
         self.client.subscribe(exactly(self.topic(STOP)), self._ordered)
         self.client.subscribe(exactly(self.topic("command")), self._command)
         self.client.subscribe(exactly(self.topic(TOPIC)), self._driven)
-        self.client.late, self.client.reads_on = self._late, True
+        self.client.late, self.client.reads_on, self.client.begun = self._late, True, self._begun
 
     def topic(self, name: str) -> str:
         """Put the robot's prefix before a topic's name."""

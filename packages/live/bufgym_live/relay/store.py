@@ -12,7 +12,6 @@ come and go, and commands wait.
 import asyncio
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final
 
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
@@ -21,10 +20,8 @@ from bufgym_live.relay.held import Held
 from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import NOT_REACHED, Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
-
-NOT_REACHED: Final = "not reached: its robot was away until the deadline"
 
 
 class Store:
