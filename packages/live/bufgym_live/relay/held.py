@@ -6,12 +6,14 @@ A message, its number to each receiver and the number of its sender are committe
 import math
 import os
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
 
 from bufgym.utils.errors import BufgymError
+from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
@@ -100,6 +102,10 @@ class Held:
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in ended:
             self.forget(session)
+        dated = "SELECT session, number, frame FROM delivery JOIN message ON id = message WHERE until_us > 0"
+        for id, number, frame in self._db.execute(dated).fetchall():
+            if wire.decode(frame, len(frame)).at_us > time.time() * 1e6:  # the clock went back: how old is it?
+                self.deny(self._by_id[id], number, UNKNOWN)
         yield from found.values()
 
     def look(self) -> None:

@@ -147,7 +147,9 @@ class Outbox:
             else:
                 late = over and self._hub.orders.is_late(message, self._hub.now_us())
                 why = NOT_REACHED if late else "withdrawn by a stop" if over else "no rule lets its robot have it"
-                self._hub.store.denied(member.session, self._sent_number, member.session.why_not(self._sent_number, why))
+                self._hub.store.denied(
+                    member.session, self._sent_number, member.session.why_not(self._sent_number, why)
+                )
         return True
 
     async def _send(self, outgoing: Outgoing) -> None:

@@ -293,8 +293,8 @@ class Robot:
         if any(stop.holds for stop in new):
             try:
                 await self.source.on_command({"command": STOP})
-            except BufgymError as error:
-                why = str(error)
+            except Exception as error:  # whatever it is, the stop is written down
+                why = str(error) if isinstance(error, BufgymError) else f"{type(error).__name__}: {error}"
         async with self._saving:
             said = self.latch.ledger.as_json()
             await asyncio.to_thread(self._kept.save, said)

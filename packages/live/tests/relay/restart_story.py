@@ -53,6 +53,8 @@ class Truth:
 
     goals: dict[str, Goal] = field(default_factory=dict)
     stops: dict[str, Said] = field(default_factory=dict)
+    released: list[str] = field(default_factory=list)
+    """Stops of which somebody has begun the release."""
     begun: Counter[str] = field(default_factory=Counter)
     done: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
@@ -209,17 +211,19 @@ class Field:
     async def _stop(self, operator: Session) -> None:
         with contextlib.suppress(BufgymError):
             id = await operator.stop("r")
-            self.truth.stops[id] = Said(time.monotonic())
+            now_s = time.monotonic()  # somebody may have released it before its answer came
+            begun = now_s if covers(self.truth.released, id) else None
+            self.truth.stops[id] = Said(now_s, begun)
             self.truth.counts["stops"] += 1
 
     async def _release(self, operator: Session, ids: list[str]) -> None:
+        self.truth.released += ids
         for said in self.truth.covered(ids):
             said.begun_s = said.begun_s or time.monotonic()
         with contextlib.suppress(BufgymError):
             await operator.release("r", " ".join(ids))
             self.truth.counts["releases"] += 1
             for said in self.truth.covered(ids):
-                said.begun_s = said.begun_s or time.monotonic()  # of one whose ``stop`` returned meanwhile
                 said.released_s = said.released_s or time.monotonic()
 
     def _begin(self, work: Coroutine[Any, Any, Any]) -> None:
@@ -290,6 +294,7 @@ class Field:
                 self.truth.wrong.append(f"refused, but executed: goal {id}: {goal.answer}")
         self.truth.goals.clear()
         self.truth.stops.clear()
+        self.truth.released.clear()
 
     def _held(self) -> list[str]:
         return sorted(stop.id for stop in self.robot.latch.ledger.held)
