@@ -21,10 +21,10 @@ def place(relay: str, name: str) -> Path:
 
 
 class Kept:
-    """The file; ``fault`` says why it could not be read or written at the last try."""
+    """The file; ``fault`` says why it could not be read or written at the last try, ``is_behind`` that it must be."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.fault = path, ""
+        self.path, self.fault, self.is_behind = path, "", False
 
     def load(self) -> Ledger:
         """Read the stops. Of a file that cannot be read nobody knows whether one holds: so the robot is stopped."""
@@ -61,6 +61,7 @@ class Kept:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-            self.fault = ""
+            self.fault, self.is_behind = "", False
         except OSError as error:
+            self.is_behind = True
             self.fault = f"{self.path}: {error.strerror or error}: its stops are forgotten when it restarts"

@@ -174,6 +174,8 @@ class Robot:
         """Run until the source has no more, or until cancelled."""
 
         async def status() -> None:
+            if self._kept.is_behind:
+                await self._write()
             self.say("status", self.status())
 
         async def queue() -> None:
@@ -295,10 +297,13 @@ class Robot:
                 await self.source.on_command({"command": STOP})
             except Exception as error:  # whatever it is, the stop is written down
                 why = str(error) if isinstance(error, BufgymError) else f"{type(error).__name__}: {error}"
+        await self._write()
+        self._say_answer(new[-1].id, why)
+
+    async def _write(self) -> None:
         async with self._saving:
             said = self.latch.ledger.as_json()
             await asyncio.to_thread(self._kept.save, said)
             self._said = said
         if self._kept.fault:
             self.client.note(self._kept.fault)
-        self._say_answer(new[-1].id, why)

@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 from cut_cases import cuttable
 from loop_cases import beside, compiled
-from relay_cases import client, nothing, relay, settings, until, wait
+from relay_cases import client, full_disk, nothing, relay, settings, until, wait
 from test_stops import COMMAND, RULE, Program
 
 from bufgym.utils.errors import BufgymError
-from bufgym_live.relay import backoff, claims
+from bufgym_live.relay import backoff, claims, orders
+from bufgym_live.relay.kept import Kept
 from bufgym_live.relay.robot import Robot
 from bufgym_live.relay.session import Session
 
@@ -119,3 +120,54 @@ async def test_a_program_with_a_fault_at_a_stop_stands_all_the_same() -> None:
             await until("it is written down", lambda: [stop["id"] for stop in robot.status()["stops"]] == [id])
             await until("an answer", lambda: robot.status()["answer"] == {"id": id, "why": "ValueError: no brake"})
             assert json.loads(robot._kept.path.read_text())["stops"][0]["id"] == id
+
+
+async def test_what_a_full_disk_did_not_take_is_written_later(tmp_path: Path) -> None:
+    """By the relay and by the robot: both restart, and the stop holds."""
+    async with relay(settings(folder=tmp_path)) as server:
+        url = f"ws://127.0.0.1:{server.port}"
+        robot, operator = Robot(url, "r", Program(), policy="drop-oldest"), Session(url, "operator")
+        async with beside(operator.run(), robot.run()):
+            await wait("the robot", robot.client.ready.wait())
+            with full_disk():
+                with pytest.raises(BufgymError, match="it is in force, but lost when the relay restarts"):
+                    await wait("the stop", operator.stop("r"))
+                await until("it stands", lambda: robot.latch.is_set)
+                await until("it cannot be written", lambda: robot._kept.is_behind)
+            await until("it is written", lambda: not robot._kept.is_behind)
+            await until("it is written here, too", lambda: not server.hub.desk._unwritten)
+    assert Kept(robot._kept.path).load().held
+    async with relay(settings(folder=tmp_path)) as server:
+        assert server.hub.orders.ledgers["r"].held
+
+
+async def test_stops_of_many_names_keep_none_from_a_robot_that_is_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its operator is at the same address as the client that says them."""
+    monkeypatch.setattr(orders, "MOST_ROBOTS", 20)
+    async with relay(settings()) as server, client(server.port, name="odd") as odd:
+        url = f"ws://127.0.0.1:{server.port}"
+        robot, operator = Robot(url, "r", Program(), policy="drop-oldest"), Session(url, "operator")
+        async with beside(operator.run(), robot.run()):
+            await wait("the robot", robot.client.ready.wait())
+            for k in range(30):
+                stop = json.dumps({"command": "stop", "id": f"odd-{k + 1}"}).encode()
+                await odd.put(f"/robots/x{k}/stop", stop, encoding="json", seq=k + 1)
+            assert [said.get("code") for said in await odd.rest()].count("too_many") == 10
+            id = await wait("a stop", operator.stop("r"))
+            await until("it stands", lambda: robot.latch.is_set)
+            await wait("its release", operator.release("r", id))
+            await until("it is free", lambda: not robot.latch.is_set)
+            assert len(server.hub.orders.ledgers) == len(server.hub.desk.said) == 20
+
+
+async def test_a_welcome_counts_what_the_last_connection_has_begun(tmp_path: Path) -> None:
+    """It breaks while its message waits for the disk: the next one must not give another message this number."""
+    async with relay(settings(folder=tmp_path)) as server, client(server.port, session="r", robot="r"):
+        async with client(server.port, session="ann") as ann:
+            work = server.hub.store.disk.do(time.sleep, 0.5)
+            await ann.put(COMMAND, b'{"command": "cancel"}', encoding="json", seq=1, no_drop=True)
+            await until("it waits", lambda: server.hub.holding._running)
+            ann.socket.transport.abort()
+        async with client(server.port, session="ann") as ann:
+            assert ann.welcome["received"] == 1
+        await wait("the disk", work)
