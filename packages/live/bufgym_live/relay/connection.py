@@ -25,7 +25,7 @@ from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.rules import Permissions
-from bufgym_live.relay.stored import StoredSession, command_number
+from bufgym_live.relay.stored import UNKNOWN, StoredSession, command_number
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -103,7 +103,7 @@ class Connection:
             if (known := self.session.outcomes.get(seq)) is not None:
                 self._hub.tell_outcome(known)
             elif seq <= self.session.received and not await self._hub.store.waits(self.session, seq):
-                self.tell("delivered", seq=seq, receivers=1, lost=1, why="nobody knows whether it was executed")
+                self.tell("delivered", seq=seq, receivers=1, lost=1, why=UNKNOWN)
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
@@ -178,7 +178,8 @@ class Connection:
 
     async def _one(self, size_bytes: int, work: Work) -> None:
         try:
-            await self._hub.turns.of(self._caller.identity.key, work)
+            if self._ending is None:  # else its client says it again
+                await self._hub.turns.of(self._caller.identity.key, work)
         finally:
             self._release(size_bytes)
 
@@ -316,8 +317,7 @@ class Connection:
 
 async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], None]) -> None:
     """Serve a client from its hello to the end; call ``greeted`` after the hello."""
-    hub, stage = caller.hub, "hello"
-    hello_s = hub.config.limits.hello_s
+    hub, stage, hello_s = caller.hub, "hello", caller.hub.config.limits.hello_s
     try:
         try:
             async with asyncio.timeout(hello_s):
@@ -331,6 +331,8 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             if (other := hub.claims.rival(admitted.robot, *about)) is not None:
                 hub.take_over(*other.key)
                 hub.store.forget(other)  # what waits for it is lost, as its senders are told
+        hub.take_over(caller.identity.key, admitted.session)
+        await hub.store.orders_done(caller.identity, admitted.session)
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             # Nothing is awaited from ``take_over`` to here, or a second connection of the session could come between.

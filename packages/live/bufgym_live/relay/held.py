@@ -6,19 +6,21 @@ A message, its number to each receiver and the number of its sender are committe
 import math
 import os
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
 
 from bufgym.utils.errors import BufgymError
+from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.facts import Facts
 from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.rules import Identity
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import UNKNOWN, Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
@@ -82,7 +84,7 @@ class Held:
         for row in self._db.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id").fetchall():
             id, name, address, email, temporary, received, numbered = row
             session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
-            session.kept = True
+            session.kept, session.sent = True, numbered
             for one, text in self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)):
                 with suppress(BufgymError):  # an earlier release took more; its client is told when it subscribes again
                     session.durable[one] = pattern(text)
@@ -100,6 +102,10 @@ class Held:
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in ended:
             self.forget(session)
+        dated = "SELECT session, number, frame FROM delivery JOIN message ON id = message WHERE until_us > 0"
+        for id, number, frame in self._db.execute(dated).fetchall():
+            if wire.decode(frame, len(frame)).at_us > time.time() * 1e6:  # the clock went back: how old is it?
+                self.deny(self._by_id[id], number, UNKNOWN)
         yield from found.values()
 
     def look(self) -> None:
@@ -234,7 +240,7 @@ class Held:
         for id, number in self._db.execute(late, (now_us,)).fetchall():
             session = self._by_id.get(id)
             if session is not None and session.away_s < math.inf:
-                self.deny(session, number, why)
+                self.deny(session, number, session.why_not(number, why))
 
     def waits(self, sender: StoredSession, seq: int) -> bool:
         """Whether a message of this sender is still held."""
@@ -294,7 +300,7 @@ class Held:
                 (sender, seq, receivers, waiting, gone, size_bytes, why) = self._db.execute(
                     "UPDATE message SET waiting = waiting - 1, lost = lost + ?, why = coalesce(nullif(?, ''), why) "
                     "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why",
-                    (lost, session.answers.get(number, ""), id),
+                    (lost, session.answers.get(number, UNKNOWN if lost else ""), id),
                 ).fetchone()
                 sizes.append(size_bytes)
                 if waiting == 0:

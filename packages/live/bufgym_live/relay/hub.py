@@ -66,6 +66,7 @@ class Hub:
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
         self.claims = Claims(self.audit, lambda message: self.publish(None, message), clock, self.now_us)
+        self.orders.is_here = lambda robot: self.claims.get(robot) is not None
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
@@ -317,6 +318,7 @@ class Hub:
         self.drivers.tick()
         self.quotas.tidy()
         self.store.tick(now_us)
+        self.desk.tick()
         if self.peers is not None:
             self.peers.tick()
         for disk in self.disks:

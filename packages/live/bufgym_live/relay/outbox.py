@@ -15,7 +15,7 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.member import Member
 from bufgym_live.relay.outgoing import Outgoing
-from bufgym_live.relay.store import NOT_REACHED
+from bufgym_live.relay.stored import NOT_REACHED
 from bufgym_live.relay.subscriber import Lane, Subscription, make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
@@ -156,11 +156,14 @@ class Outbox:
             over = self._hub.orders.is_over(message, self._hub.now_us())
             if member.permissions.allow("receive", topic) and not over:
                 self._in_flight.append(self._sent_number)
+                member.session.sent = max(member.session.sent, self._sent_number)
                 await self._send(Outgoing(message))
             else:
                 late = over and self._hub.orders.is_late(message, self._hub.now_us())
                 why = NOT_REACHED if late else "withdrawn by a stop" if over else "no rule lets its robot have it"
-                self._hub.store.denied(member.session, self._sent_number, why)
+                self._hub.store.denied(
+                    member.session, self._sent_number, member.session.why_not(self._sent_number, why)
+                )
         return True
 
     async def _send(self, outgoing: Outgoing) -> None:

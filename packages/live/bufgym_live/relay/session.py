@@ -14,7 +14,7 @@ import re
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Container, Coroutine
 from typing import Any, Final
 from urllib.parse import SplitResult
 
@@ -81,6 +81,8 @@ class Session:
         """Called with a command that came after its deadline, in place of ``on_message``."""
         self.reads_on = False
         """Whether messages are read on while the program is at work on one, so that a stop overtakes them."""
+        self.begun: Container[int] = ()
+        """Numbers of commands that the program has begun: one that comes again after a break is not late."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
         self._no_drop: tuple[re.Pattern[str], ...] = ()
@@ -310,7 +312,7 @@ class Session:
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
-        if self.deadlines.is_late(message):
+        if self.deadlines.is_late(message) and message.number not in self.begun:
             self.late(message)
             why = "came too late"
         else:

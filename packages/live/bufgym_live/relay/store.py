@@ -16,15 +16,15 @@ from typing import Final
 
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
-from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.disk import STALL_S, Disk
 from bufgym_live.relay.held import Held
 from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import NOT_REACHED, Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
 
-NOT_REACHED: Final = "not reached: its robot was away until the deadline"
+_POLL_S: Final = 0.005
 
 
 class Store:
@@ -76,6 +76,15 @@ class Store:
         session = self.sessions.get((identity.key, name))
         if session is not None and (received > session.received or numbered > session.numbered):
             await self.disk.do(self._held.remember, session, received, numbered)
+
+    async def orders_done(self, identity: Identity, name: str) -> None:
+        """Wait until a session's orders of an earlier connection are done, unless the disk stalls.
+
+        Otherwise its client would not know that a message was taken, and might give another one its number.
+        """
+        session, until_s = self.sessions.get((identity.key, name)), self._clock() + STALL_S
+        while session is not None and session.orders and self._clock() < until_s:
+            await asyncio.sleep(_POLL_S)
 
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> StoredSession:
         """Open the session of this name; a new session begins at the client's numbers.

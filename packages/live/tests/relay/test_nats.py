@@ -11,8 +11,9 @@ from relay_cases import client, nothing, relay, settings, until, untrusted, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import Nats, StoreLimits
+from bufgym_live.relay.clock import Delays
 from bufgym_live.relay.hub import Hub
-from bufgym_live.relay.peers import Delays, Peers
+from bufgym_live.relay.peers import Peers
 from bufgym_live.robot.sockets import free_port
 
 pytestmark = needs_server
