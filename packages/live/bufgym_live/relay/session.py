@@ -23,7 +23,7 @@ from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.deadlines import Deadlines
 from bufgym_live.relay.inbox import Inbox
 from bufgym_live.relay.orders import is_stop
-from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wanted import OnMessage, Wanted
@@ -85,7 +85,7 @@ class Session:
         """Numbers of commands that the program has begun: one that comes again after a break is not late."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
-        self._no_drop: tuple[re.Pattern[str], ...] = ()
+        self._no_drop: tuple[Pattern, ...] = ()
         self._unanswered = Unanswered(self.deadlines.dated)
         self._stops = Stops(self.deadlines.dated, self._session)
         self._inbox = Inbox()
@@ -260,7 +260,7 @@ class Session:
         self.welcome = said
         self.deadlines.welcomed(said)
         await self._stops.send(self._connection.send)
-        self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
+        self._no_drop = tuple(map(pattern, said.get("no_drop", ())))
         if not self.stands_in:
             self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
         for subscription in self._subscriptions.asked(self.stands_in):
