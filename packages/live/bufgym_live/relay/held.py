@@ -221,10 +221,10 @@ class Held:
 
     def settle_acked(self, session: StoredSession) -> None:
         """End the deliveries that the session has acked; if that cannot be written, a later ack does it."""
-        session.settling = False
+        session.settling, acked = False, session.acked  # read once: the event loop moves it on
         with self.bearable():
-            self._settle(session, 0, session.acked, 0)
-            for number in [one for one in session.answers if one <= session.acked]:
+            self._settle(session, 0, acked, 0)
+            for number in [one for one in list(session.answers) if one <= acked]:
                 session.answers.pop(number, None)
 
     def deny(self, session: StoredSession, number: int, why: str) -> None:

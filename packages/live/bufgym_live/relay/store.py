@@ -197,6 +197,7 @@ class Store:
 
     def denied(self, session: StoredSession, number: int, why: str) -> None:
         """Drop a message that the session must not have any more."""
+        session.answers[number] = why  # at once: an ack of a later one may be written first
         self.disk.later(self._held.deny, session, number, why)
 
     def waits(self, sender: StoredSession, seq: int) -> asyncio.Future[bool]:

@@ -17,6 +17,7 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff, claims, orders
 from bufgym_live.relay.kept import Kept
 from bufgym_live.relay.robot import Robot
+from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
 
 pytestmark = compiled
@@ -171,3 +172,35 @@ async def test_a_welcome_counts_what_the_last_connection_has_begun(tmp_path: Pat
         async with client(server.port, session="ann") as ann:
             assert ann.welcome["received"] == 1
         await wait("the disk", work)
+
+
+async def test_a_command_that_was_dropped_is_not_executed_by_the_ack_of_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The disk is at work meanwhile, so acks of the first and the third are written together."""
+    async with relay(settings()) as server:
+        store, who = server.hub.store, Identity("127.0.0.1")
+        ann, robot = (store.open(name, who, False, 0, 0) for name in ("ann", "r"))
+        for number in range(1, 6):
+            await store.hold(ann, number, COMMAND, b"", [robot])
+        work = store.disk.do(time.sleep, 0.3)
+        store.acked(robot, 1)
+        store.denied(robot, 2, "came too late")
+        store.acked(robot, 3)
+        await wait("the disk", work)
+        await until("outcomes", lambda: 3 in ann.outcomes)
+        assert [ann.outcomes[number].why for number in (1, 2, 3)] == ["", "came too late", ""]
+
+        settle = store._held._settle
+
+        def settled(*words: Any) -> None:
+            settle(*words)
+            if words[2] == 4:  # its robot refuses the next one in this moment
+                robot.answers[5], robot.acked = "the way is blocked", 5
+
+        monkeypatch.setattr(store._held, "_settle", settled)
+        store.acked(robot, 4)
+        await until("an outcome", lambda: 4 in ann.outcomes)
+        store.acked(robot, 5)
+        await until("an outcome", lambda: 5 in ann.outcomes)
+        assert ann.outcomes[5].why == "the way is blocked"

@@ -3,6 +3,7 @@
 No stop is lost and none comes back; no goal is executed late, twice, or while a stop holds; each answer is true.
 """
 
+import asyncio
 import contextlib
 from collections import Counter
 from collections.abc import AsyncIterator
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from loop_cases import compiled
+from loop_cases import beside, compiled
 from needs import needs
 
 for library in ("websockets", "re2"):
@@ -18,12 +19,16 @@ for library in ("websockets", "re2"):
 
 from cut_cases import cuttable  # noqa: E402
 from nats_cases import connected, nats_server, needs_server  # noqa: E402
-from relay_cases import process, settings, wait  # noqa: E402
+from relay_cases import process, settings, until, wait  # noqa: E402
 from restart_story import DEADLINE_S, Field  # noqa: E402
+from test_stops import COMMAND, Program  # noqa: E402
 
+from bufgym.utils.errors import BufgymError  # noqa: E402
 from bufgym_live.relay import Nats, backoff, claims  # noqa: E402
 from bufgym_live.relay.config import Config, Rule  # noqa: E402
+from bufgym_live.relay.robot import Robot  # noqa: E402
 from bufgym_live.relay.server import Server  # noqa: E402
+from bufgym_live.relay.session import Session  # noqa: E402
 from bufgym_live.robot.sockets import free_port  # noqa: E402
 
 pytestmark = compiled
@@ -149,3 +154,31 @@ async def test_two_relays_over_nats(rounds: int, tmp_path: Path, seed: int = 3) 
         field = await stack.enter_async_context(played(ports[1], ports[0], seed))
         field.shakes |= {"near relay": relays[0].again, "far relay": relays[1].again, "NATS": nats_again}
         await play(field, rounds, seed)
+
+
+@needs_server
+async def test_a_goal_that_nats_held_for_a_relay_that_was_away_is_not_executed_late(tmp_path: Path) -> None:
+    """The relay at the robot has restarted, and heard nothing of the clock that alone says how old the goal is."""
+    at, program = free_port("127.0.0.1"), Program()
+
+    def config(name: str, port: int = 0) -> Config:
+        where: Any = Nats(f"nats://127.0.0.1:{at}", name)
+        return settings(port=port, rules=(RULE, OTHERS), folder=tmp_path / name, nats=where)
+
+    port = free_port("127.0.0.1")
+    async with nats_server(at, tmp_path / "nats"), begun(config("near")) as near, begun(config("far", port)) as far:
+        await connected(near.server, far.server)
+        operator = Session(f"ws://127.0.0.1:{near.server.port}", "operator")
+        robot = Robot(f"ws://127.0.0.1:{port}", "r", program, policy="drop-oldest")
+        async with beside(operator.run(), robot.run()):
+            await wait("the robot", robot.client.ready.wait())
+            await wait("a goal", operator.command(COMMAND, {"command": "goal", "id": "in time"}))
+            await far.end()
+            late = asyncio.create_task(operator.command(COMMAND, {"command": "goal", "id": "late"}))
+            await asyncio.sleep(2 * DEADLINE_S)
+            await far.begin()
+            with pytest.raises(BufgymError, match="nobody knows whether it was executed"):
+                await wait("its receipt", late)
+            await until("another goal", lambda: robot.client.ready.is_set())
+            await wait("a goal", operator.command(COMMAND, {"command": "goal", "id": "next"}))
+            assert program.names == ["in time", "next"]
