@@ -7,6 +7,7 @@ from typing import Final
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.store import Store
 from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.wire import RefusedError
 
@@ -29,13 +30,15 @@ class Claims:
 
     def __init__(
         self,
+        store: Store,
         audit: Audit,
         publish: Callable[[wire.Message], None],
         clock: Callable[[], float],
         now_us: Callable[[], int],
     ) -> None:
+        self._store = store
         self._audit, self._publish, self._clock, self._now_us = audit, publish, clock, now_us
-        self._sessions: dict[str, StoredSession] = {}
+        self._sessions = {session.robot: session for session in store.sessions.values() if session.robot}
 
     def get(self, robot: str) -> StoredSession | None:
         """The session that is this robot, here or away; None if nobody has claimed it."""
@@ -66,7 +69,7 @@ class Claims:
         """Note that a session is this robot."""
         self._sessions.pop(robot, None)
         self._sessions[robot] = session
-        session.robot, session.kept = robot, True
+        self._store.claimed(session, robot)
         if len(self._sessions) > _MOST:
             del self._sessions[next(iter(self._sessions))]
 

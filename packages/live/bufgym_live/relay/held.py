@@ -28,7 +28,8 @@ MOST: Final = 256
 """Settled messages of a session whose outcomes are remembered."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS session (
-    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
+    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER,
+    robot TEXT DEFAULT '');
 CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS message (
     id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
@@ -40,8 +41,12 @@ CREATE TABLE IF NOT EXISTS outcome (
 CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS stop (robot TEXT, who TEXT, said TEXT, PRIMARY KEY (robot, who)) WITHOUT ROWID;
 """
-_ADDED: Final = ("until_us INTEGER DEFAULT 0", "why TEXT DEFAULT ''")  # columns of message that earlier files lack
-_COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
+_ADDED: Final = {
+    "message": ("until_us INTEGER DEFAULT 0", "why TEXT DEFAULT ''"),
+    "session": ("robot TEXT DEFAULT ''",),
+}
+"""Table -> columns that earlier files lack."""
+_COLUMNS: Final = "id, name, address, email, temporary, received, numbered, robot"
 
 
 class Held:
@@ -58,9 +63,10 @@ class Held:
             for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
-            for column in _ADDED:
-                with suppress(sqlite3.OperationalError):  # it is there
-                    self._db.execute(f"ALTER TABLE message ADD COLUMN {column}")
+            for table, columns in _ADDED.items():
+                for column in columns:
+                    with suppress(sqlite3.OperationalError):  # it is there
+                        self._db.execute(f"ALTER TABLE {table} ADD COLUMN {column}")
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
             (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
             if state != "ok":
@@ -82,9 +88,9 @@ class Held:
         """Read the sessions of the relay that ran before, and forget all that ended with it."""
         ended, found = list[StoredSession](), dict[tuple[str, str], StoredSession]()
         for row in self._db.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id").fetchall():
-            id, name, address, email, temporary, received, numbered = row
+            id, name, address, email, temporary, received, numbered, robot = row
             session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
-            session.kept, session.sent = True, numbered
+            session.kept, session.sent, session.robot = True, numbered, robot
             for one, text in self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)):
                 with suppress(BufgymError):  # an earlier release took more; its client is told when it subscribes again
                     session.durable[one] = pattern(text)
@@ -131,6 +137,11 @@ class Held:
         if session.id is not None:
             with self.bearable():
                 self._save(session)
+
+    def claimed(self, session: StoredSession) -> None:
+        """Write the robot that a session has claimed to be."""
+        with self.bearable():
+            self._save(session)
 
     def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Note that matching messages are held while the session is away."""
@@ -321,9 +332,10 @@ class Held:
     def _save(self, session: StoredSession) -> None:
         """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
         who = session.identity
-        row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
+        numbers = session.received, session.numbered, session.robot
+        row = session.id, session.name, who.address, who.email, session.temporary, *numbers
         with self.transaction():
-            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
             id = self._db.execute(insert, row).lastrowid
         session.id = id
         self._by_id[id] = session

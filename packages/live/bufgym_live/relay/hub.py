@@ -65,7 +65,7 @@ class Hub:
         self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
-        self.claims = Claims(self.audit, lambda message: self.publish(None, message), clock, self.now_us)
+        self.claims = Claims(self.store, self.audit, lambda message: self.publish(None, message), clock, self.now_us)
         self.orders.is_here = lambda robot: self.claims.get(robot) is not None
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]

@@ -130,6 +130,12 @@ class Store:
         if not self._held.forget(session):
             self.disk.on_loop(self.sessions.setdefault, session.key, session)
 
+    def claimed(self, session: StoredSession, robot: str) -> None:
+        """Note the robot that a session has claimed to be, also for a relay that starts anew."""
+        if session.robot != robot or not session.kept:
+            session.robot, session.kept = robot, True
+            self.disk.later(self._held.claimed, session)
+
     async def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Hold matching messages while the session is away.
 
