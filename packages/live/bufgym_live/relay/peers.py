@@ -60,6 +60,7 @@ class Peers:
         """Ids of the messages of which NATS has not said whether it has them, in order."""
         self._awake = asyncio.Event()
         self._answers = Answers(hub)
+        hub.claims.told = lambda robot, address: self._tell(robot=robot, at=address)
         self._telling: deque[dict[str, Any]] = deque()
         """What is to be said to the others before any message."""
         self._tasks = Tasks()
@@ -168,7 +169,8 @@ class Peers:
             self._tell(robot=stopped_robot(message.topic), stops=stops)
 
     def _tell(self, **said: Any) -> None:
-        self._telling.append(said)
+        if self._bus is not None:  # else the others ask for all once it is back
+            self._telling.append(said)
         self._awake.set()
 
     def _told(self, data: bytes) -> None:
@@ -190,6 +192,8 @@ class Peers:
             case {"relay": str(), "robot": str(robot), "stops": list(stops)} if "/" not in robot:
                 if self._goes("send", f"/robots/{robot}/{STOP}"):
                     self._hub.desk.take(robot, list(read(stops)), self, self.session.identity.key)
+            case {"relay": str(relay), "robot": str(robot), "at": str(address)}:
+                self._hub.claims.elsewhere(robot, relay[:100], address[:100])
             case {"relay": str(), "seq": int(number), "lost": int(lost), "why": str(why)}:
                 self._answers.came(number, lost, why)
             case _:
