@@ -86,7 +86,7 @@ def workload_lines(workload: Workload) -> list[str]:
 
 
 def from_bag(
-    file: str,
+    files: list[str],
     /,
     *,
     recording: RecordingOptions = RecordingOptions(),
@@ -95,7 +95,7 @@ def from_bag(
     """Take messages and motion from a robot's recording (extra 'ros').
 
     Args:
-        file: MCAP, ROS 1 bag, rosbag2 folder or .db3, also in zstd; alone: its topics are listed.
+        files: MCAP, ROS 1 bag, rosbag2 folder or .db3, also packed; several are one drive. Alone: topics are listed.
         out: Write the workload to this CSV file (time_s,bytes,topic[,x]).
     """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
@@ -104,7 +104,7 @@ def from_bag(
     if recording.odom is None:
         refuse(given(recording, *MOTION), "needs --odom")
     with bar(None, True, "message") as advance:
-        bag = read_bag(file, arguments.pop("odom", None), advance)
+        bag = read_bag(files, arguments.pop("odom", None), advance)
     if recording.topics is None and out is None and recording.odom is None:
         print(printable(f"{bag.path} ({bag.kind})") + "\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))
