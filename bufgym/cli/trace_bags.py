@@ -157,12 +157,12 @@ def from_poses(
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """List every topic of a recording with its type, topics without messages last."""
     from bufgym.traces.formats.bag_files import BETWEEN_TYPES
-    from bufgym.traces.formats.bag_poses import carries_poses
+    from bufgym.traces.formats.bag_poses import carries_motion
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
     for topic in summary:
         type = bag.topics[topic.topic]
-        poses = any(carries_poses(topic.topic, one) for one in type.split(BETWEEN_TYPES))
+        poses = any(carries_motion(topic.topic, one) for one in type.split(BETWEEN_TYPES))
         cells.append([topic.topic, *_summary_cells(topic), "yes" if poses else "", type])
     with_messages = {topic.topic for topic in summary}
     cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]

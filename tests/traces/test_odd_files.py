@@ -152,6 +152,14 @@ def test_a_car_whose_poses_come_in_bursts_does_not_jump(tmp_path: Path) -> None:
         assert len(caught) == (step_m == 3)
 
 
+def test_poses_in_bursts_are_as_valid_as_others(tmp_path: Path) -> None:
+    """Two poses 3 us apart, 40 ms to the next two, and each goes 0.02 m: 299 steps, in fields of 2 m."""
+    motion = read_motion(ODD_FILES / "turn7" / "burst.txt")
+    assert (motion.total, motion.duration_us) == (pytest.approx(2.99), 5_960_003)
+    fast = "".join(f"{k * 3e-6:.6f} {k} 0 0 0 0 0 1\n" for k in range(300))
+    refuse("median step of the times = .3e-06 s", read_motion, written(tmp_path, fast, "fast.txt"))
+
+
 def test_the_command_says_a_warning_in_a_line(tmp_path: Path) -> None:
     path = written(tmp_path, "0 1\n1 1\n3601 1\n3602 1\n")
     with warnings.catch_warnings(record=True) as caught:

@@ -54,8 +54,8 @@ def read_bag(path: StrPath | Sequence[StrPath], odom: str | None = None, advance
     Args:
         path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file (see `splits`); several are read as one, in
             order of time, and named after the first.
-        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``), of one
-            publisher alone (``TOPIC@2``).
+        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``, also over
+            a chain of transforms, with those of ``/tf_static``), of one publisher alone (``TOPIC@2``).
         advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
@@ -76,7 +76,7 @@ def read_bag(path: StrPath | Sequence[StrPath], odom: str | None = None, advance
             times.add(channel, logged_ns, data)
             seams.add(file, logged_ns)
             sizes.append(max(1, len(data)))
-            if collector is not None and channel.topic == collector.topic:
+            if collector is not None and collector.wants(channel.topic):
                 collector.add(file, channel, logged_ns, data)
         advance(1)
     seams.said(path)

@@ -12,7 +12,7 @@ import numpy as np
 
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
 from bufgym.traces.formats.text import Line, TextFile, open_text
-from bufgym.traces.formats.units import LEAST_STEP_S, SLOW_STEP_S
+from bufgym.traces.formats.units import LEAST_STEP_S, SLOW_STEP_S, steady_step
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
 
 RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
@@ -134,7 +134,7 @@ class _Kept:
             raise fault(self._path, f"must hold at least 2 {what} of different times, has {len(self._times)}")
         time_us = np.frombuffer(self._times, np.int64)
         step_s = float(np.median(np.diff(time_us))) / US_PER_S
-        if step_s < LEAST_STEP_S:
+        if step_s < LEAST_STEP_S and steady_step(time_us) / US_PER_S < LEAST_STEP_S:
             rule = f"must be at least {LEAST_STEP_S:g} s (are the times in another unit?)"
             raise fault(self._path, rule, value=f"{step_s:g} s", field="median step of the times")
         if step_s > SLOW_STEP_S:
