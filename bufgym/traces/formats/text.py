@@ -33,6 +33,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WHOLE = re.compile(r"[0-9]+")
 NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"  # Pattern of a plain finite decimal number
 _NUMBER = re.compile(NUMBER)
+_NO_JSON: Final = re.compile(rb"\s*\[ *(?:ID|SUM|[0-9]+)\] +\S")
 _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 
 
@@ -210,11 +211,11 @@ class TextFile:
     def first(self) -> Line | None:
         """The first line that is not blank, None in an empty file.
 
-        JSON may be a single line of any length, so only its opening bracket is returned.
+        JSON may be a single line of any length, so only its opening bracket is returned; iperf's text begins with one.
         """
         for number, raw in self._raw_lines():
             bracket = raw.lstrip()[:1]
-            if bracket in (b"[", b"{"):
+            if bracket in (b"[", b"{") and not _NO_JSON.match(raw):
                 return Line(self.path, number, bracket.decode())
             line = _parsed_line(self.path, number, raw)
             if line.text:
