@@ -124,23 +124,32 @@ def from_poses(
     *,
     format: Literal["tum", "euroc", "kitti"] | None = None,
     times: str | None = None,
+    time: str | None = None,
+    pose: list[str] | None = None,
+    time_unit: str = "",
     measured: MotionOptions = MotionOptions(),
     bridge_gaps: bool = False,
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
 ) -> None:
-    """Take camera motion from a trajectory: TUM, EuRoC or KITTI.
+    """Take camera motion from a trajectory: TUM, EuRoC, KITTI, NMEA or any table.
 
     Args:
         file: The trajectory, plain or gzip'd.
         format: Its format (default: recognised by its first line).
         times: KITTI's times (default: NAME_times.txt beside NAME.txt).
+        time: Of any table: the column of times, by name or number; with --pose.
+        pose: The columns of x y [z [qx qy qz qw]], or latitude longitude [altitude].
+        time_unit: Unit of the times: s, ms, us, ns (default: that in the column's name, else by the steps).
         bridge_gaps: Write it in spite of gaps.
         out: Write the motion to this CSV file (t_s,motion).
     """
-    from bufgym.traces import read_motion, write_motion_csv
+    from bufgym.traces import PoseColumns, read_motion, write_motion_csv
 
+    if (time is None) != (pose is None):
+        raise BufgymError("--time and --pose go together")
+    columns = None if time is None or pose is None else PoseColumns(time, tuple(pose), time_unit)
     with bar(None, True, "line") as advance:
-        motion = read_motion(file, measured.settings(), format=format, times=times, advance=advance)
+        motion = read_motion(file, measured.settings(), format=format, times=times, columns=columns, advance=advance)
     seconds = motion.duration_us / 1e6
     print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
     print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")

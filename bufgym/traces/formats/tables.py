@@ -111,29 +111,36 @@ def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[
     places, names, count, separator = list[int](), list[str](), 0, ""
     for line in lines:
         if not count:
-            separator = next((mark for mark in ";,\t" if mark in line.text), "")
-            header = _cells(line.text.lstrip("#"), separator)
+            separator = separator_of(line.text)
+            header = cells_of(line.text.lstrip("#"), separator)
             count = len(header)
-            places = [_place(line, header, name) for name in wanted]
+            places = [place_of(line, header, name) for name in wanted]
             names = [header[k] for k in places]
-            if not all(re.fullmatch(NUMBER, header[k]) or _date_us(header[k]) for k in places):
+            if not all(re.fullmatch(NUMBER, header[k]) or date_us(header[k]) for k in places):
                 continue
         if line.text.startswith("#"):
             continue
-        cells = _cells(line.text, separator)
+        cells = cells_of(line.text, separator)
         if len(cells) != count:
             raise line.error(line.text, f"must have {count} columns, has {len(cells)}")
         yield line, [cells[k] for k in places], names
 
 
-def _cells(text: str, separator: str) -> list[str]:
+def separator_of(text: str) -> str:
+    """What stands between the cells of a line; empty for blanks."""
+    return next((mark for mark in ";,\t" if mark in text), "")
+
+
+def cells_of(text: str, separator: str) -> list[str]:
+    """The cells of a line, without quotes; between semicolons, commas are decimal points."""
     if separator == ";":
         text = text.replace(",", ".")  # decimal commas
     cells = [cell.strip().strip('"') for cell in text.split(separator or None)]
     return cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells
 
 
-def _place(line: Line, header: list[str], name: str) -> int:
+def place_of(line: Line, header: list[str], name: str) -> int:
+    """The place of a column that is named, or numbered from 1."""
     if name in header:
         return header.index(name)
     if name.isdecimal() and 1 <= int(name[:6]) <= len(header):
@@ -143,13 +150,13 @@ def _place(line: Line, header: list[str], name: str) -> int:
 
 def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_s: float = 1.0) -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
-    start_us = _date_us(time)
+    start_us = date_us(time)
     if start_us is None:
         start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S / time_s) * time_s * US_PER_S)
     return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
 
 
-def _date_us(text: str) -> int | None:
+def date_us(text: str) -> int | None:
     """Microseconds since 1970 of an ISO date, in UTC where it names no zone; None for other text."""
     try:
         date = datetime.fromisoformat(text if "-" in text else "")
