@@ -196,6 +196,17 @@ def test_what_a_table_of_poses_lacks_is_said(tmp_path: Path) -> None:
     refuse("is XML, as of GPX", read_motion, written(tmp_path, "<?xml version='1.0'?>\n<gpx/>\n", "a.gpx"))
 
 
+def test_messages_of_other_tools(tmp_path: Path) -> None:
+    """Times in s, in ms by the header, and as dates; a topic, and columns of no use."""
+    for text in (
+        "frame.number,frame.time_epoch,frame.len\n1,1700000000.25,10\n2,1700000001.75,20\n",
+        "stamp_ms,size,note\n250,10,a\n1750,20,b\n",
+        "channel,date,bytes\na,2024-01-31T12:00:00.25,10\na,2024-01-31T12:00:01.75,20\n",
+    ):
+        workload = read_workload(written(tmp_path, text))
+        assert (workload.arrival_us.tolist(), workload.size_bytes.tolist()) == ([0, 1_500_000], [10, 20])
+
+
 def test_receivers_of_satellites(tmp_path: Path) -> None:
     """A thousandth of a degree of latitude at 45 degrees is 111.13 m, over midnight in 2 s; also as JSON and as CSV."""
     fix = "$GPGGA,{0}.00,45{1},N,00700.0000,W,1,08,0.9,100.0,M,46.9,M,,*47\n"
