@@ -86,7 +86,7 @@ def workload_lines(workload: Workload) -> list[str]:
 
 
 def from_bag(
-    file: str,
+    files: list[str],
     /,
     *,
     recording: RecordingOptions = RecordingOptions(),
@@ -95,7 +95,7 @@ def from_bag(
     """Take messages and motion from a robot's recording (extra 'ros').
 
     Args:
-        file: MCAP, ROS 1 bag, rosbag2 folder or .db3, also in zstd; alone: its topics are listed.
+        files: MCAP, ROS 1 bag, rosbag2 folder or .db3, also packed; several are one drive. Alone: topics are listed.
         out: Write the workload to this CSV file (time_s,bytes,topic[,x]).
     """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
@@ -104,7 +104,7 @@ def from_bag(
     if recording.odom is None:
         refuse(given(recording, *MOTION), "needs --odom")
     with bar(None, True, "message") as advance:
-        bag = read_bag(file, arguments.pop("odom", None), advance)
+        bag = read_bag(files, arguments.pop("odom", None), advance)
     if recording.topics is None and out is None and recording.odom is None:
         print(printable(f"{bag.path} ({bag.kind})") + "\n")
         print("\n".join(_listed(bag, workload_from_bag(bag).summary() if len(bag.time_ns) else [])))
@@ -124,23 +124,32 @@ def from_poses(
     *,
     format: Literal["tum", "euroc", "kitti"] | None = None,
     times: str | None = None,
+    time: str | None = None,
+    pose: list[str] | None = None,
+    time_unit: str = "",
     measured: MotionOptions = MotionOptions(),
     bridge_gaps: bool = False,
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
 ) -> None:
-    """Take camera motion from a trajectory: TUM, EuRoC or KITTI.
+    """Take camera motion from a trajectory: TUM, EuRoC, KITTI, NMEA or any table.
 
     Args:
         file: The trajectory, plain or gzip'd.
         format: Its format (default: recognised by its first line).
         times: KITTI's times (default: NAME_times.txt beside NAME.txt).
+        time: Of any table: the column of times, by name or number; with --pose.
+        pose: The columns of x y [z [qx qy qz qw]], or latitude longitude [altitude].
+        time_unit: Unit of the times: s, ms, us, ns (default: that in the column's name, else by the steps).
         bridge_gaps: Write it in spite of gaps.
         out: Write the motion to this CSV file (t_s,motion).
     """
-    from bufgym.traces import read_motion, write_motion_csv
+    from bufgym.traces import PoseColumns, read_motion, write_motion_csv
 
+    if (time is None) != (pose is None):
+        raise BufgymError("--time and --pose go together")
+    columns = None if time is None or pose is None else PoseColumns(time, tuple(pose), time_unit)
     with bar(None, True, "line") as advance:
-        motion = read_motion(file, measured.settings(), format=format, times=times, advance=advance)
+        motion = read_motion(file, measured.settings(), format=format, times=times, columns=columns, advance=advance)
     seconds = motion.duration_us / 1e6
     print(f"{printable(motion.name)}\n  source  {printable(motion.source)}")
     print(f"  motion  {motion.total:.3f} fields of view in {seconds:.3f} s")
@@ -157,12 +166,12 @@ def from_poses(
 def _listed(bag: Bag, summary: Sequence[TopicSummary]) -> list[str]:
     """List every topic of a recording with its type, topics without messages last."""
     from bufgym.traces.formats.bag_files import BETWEEN_TYPES
-    from bufgym.traces.formats.bag_poses import carries_poses
+    from bufgym.traces.formats.bag_poses import carries_motion
 
     cells = [["topic", "messages", "rate (1/s)", "bytes", "share", "for --odom", "type"]]
     for topic in summary:
         type = bag.topics[topic.topic]
-        poses = any(carries_poses(topic.topic, one) for one in type.split(BETWEEN_TYPES))
+        poses = any(carries_motion(topic.topic, one) for one in type.split(BETWEEN_TYPES))
         cells.append([topic.topic, *_summary_cells(topic), "yes" if poses else "", type])
     with_messages = {topic.topic for topic in summary}
     cells += [[name, "0", "-", "0", "-", "", type] for name, type in bag.topics.items() if name not in with_messages]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +16,7 @@ from bufgym.utils.libraries import library
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from bufgym.traces import Trace
+    from bufgym.traces import Columns, Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
 _MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows
@@ -31,14 +32,40 @@ Column = Annotated[
 ]
 
 
-def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+@Parameter(name="*")
+@dataclass(frozen=True)
+class TableOptions:
+    time: str | None = None
+    """Of any table: the column of times, by name or number; with --rate."""
+    rate: str | None = None
+    """The column of rates."""
+    unit: str = "bit/s"
+    """Unit of the rates: B/s, kB/s, Mbit/s, ..."""
+    time_unit: str = ""
+    """Unit of the times: s, ms, us, ns (default: that in the column's name, else s)."""
+
+    def columns(self) -> Columns | None:
+        """The columns to read; None where the file's format says."""
+        from bufgym.traces import Columns
+
+        if self.time is None and self.rate is None:
+            return None
+        if self.time is None or self.rate is None:
+            raise BufgymError("--time and --rate go together")
+        return Columns(self.time, self.rate, self.unit, self.time_unit)
+
+
+Table = TableOptions()
+
+
+def info(files: Files, /, *, format: Format = None, column: Column = None, table: TableOptions = Table) -> int:
     """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
 
     failed = 0
     for k, name in enumerate(files):
         try:
-            trace = traces.load(name, format, column=column)
+            trace = traces.load(name, format, column=column, columns=table.columns())
         except TraceError as error:
             failed += 1
             print(f"bufgym: error: {error}", file=sys.stderr)
@@ -52,14 +79,14 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
     return 2 if failed else 0
 
 
-def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+def validate(files: Files, /, *, format: Format = None, column: Column = None, table: TableOptions = Table) -> int:
     """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
 
     failed = 0
     for name in files:
         try:
-            trace = traces.load(name, format, column=column)
+            trace = traces.load(name, format, column=column, columns=table.columns())
         except TraceError as error:
             failed += 1
             print(f"error  {error}")
@@ -71,7 +98,16 @@ def validate(files: Files, /, *, format: Format = None, column: Column = None) -
     return 1 if failed else 0
 
 
-def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:
+def convert(
+    files: Files,
+    /,
+    *,
+    out: Path,
+    to: str | None = None,
+    format: Format = None,
+    column: Column = None,
+    table: TableOptions = Table,
+) -> None:
     """Write bandwidth traces in another format and name the loss.
 
     Args:
@@ -85,7 +121,7 @@ def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format
         option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
         raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
     for name, target in _targets(files, out, to):
-        trace = traces.load(name, format, column=column)
+        trace = traces.load(name, format, column=column, columns=table.columns())
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
         print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
@@ -108,7 +144,9 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
     return targets
 
 
-def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
+def plot(
+    files: Files, /, *, out: Path, format: Format = None, column: Column = None, table: TableOptions = Table
+) -> None:
     """Draw bandwidth traces (needs the extra 'plot').
 
     Args:
@@ -119,7 +157,7 @@ def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = 
     figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
-    loaded = [traces.load(name, format, column=column) for name in files]
+    loaded = [traces.load(name, format, column=column, columns=table.columns()) for name in files]
     figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):

@@ -137,6 +137,12 @@ def rotations(quaternion: Float64Array) -> Float64Array:
     return np.asarray(np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross, np.float64)
 
 
+def product(a: Float64Array, b: Float64Array) -> Float64Array:
+    """First turned by b, then by a: products of quaternions (x, y, z, w), each float64[m, 4]."""
+    vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+    return np.column_stack([vector, a[:, 3] * b[:, 3] - np.sum(a[:, :3] * b[:, :3], axis=1)])
+
+
 def _same_side(a: Float64Array, b: Float64Array) -> Float64Array:
     """b or -b, whichever is nearer to a: they are the same orientation."""
     return np.where(np.sum(a * b, axis=1, keepdims=True) < 0, -b, b)

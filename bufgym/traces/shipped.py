@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
+from bufgym.traces.formats.tables import Columns
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
 from bufgym.traces.trace import After, Trace
@@ -47,7 +48,12 @@ def shipped() -> dict[str, Path]:
 
 
 def load(
-    name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
+    name_or_path: StrPath,
+    format: str | None = None,
+    after: After = "loop",
+    *,
+    column: str | None = None,
+    columns: Columns | None = None,
 ) -> Trace:
     """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
 
@@ -59,7 +65,7 @@ def load(
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:
         return replace(steady(rate), name=os.fspath(name_or_path))
-    return read_trace(_resolve(name_or_path), format, after, column=column)
+    return read_trace(_resolve(name_or_path), format, after, column=column, columns=columns)
 
 
 def load_motion(name_or_path: StrPath) -> Motion:

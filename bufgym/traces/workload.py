@@ -10,7 +10,7 @@ from bufgym.traces.poses import longest_s
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array, freeze
 from bufgym.utils.errors import BufgymError
 
-MAX_MESSAGES: Final = 10**7
+MAX_MESSAGES: Final = 10**9  # A month of 400 messages a second; more is a mistake
 MAX_MESSAGE_BYTES: Final = 10**10
 
 

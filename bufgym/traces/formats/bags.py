@@ -7,8 +7,7 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from pathlib import Path
-from typing import Final
+from os import PathLike
 
 import numpy as np
 
@@ -17,12 +16,10 @@ from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.clocks import LogTimes, warn_of_shared_times
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.leaps import warn_of_leaps
-from bufgym.traces.formats.splits import damage_errors, split_messages, splits
+from bufgym.traces.formats.splits import Seams, Split, damage_errors, split_messages, splits
 from bufgym.traces.poses import Poses
 from bufgym.traces.trace import Int64Array
 from bufgym.utils.errors import BufgymError
-
-MAX_BAG_MESSAGES: Final = 10**7
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +35,7 @@ class Bag:
     place: Int64Array  # int64[n], its number in the order of the files, from 0
     poses: Poses | None = None  # the poses of the requested odometry, None if none was requested
     poses_from_ns: int = 0  # when the poses' times begin, ns since the recorder's epoch
+    files: tuple[Split, ...] = ()  # in the order in which they were read
 
 
 def matching(source: str, names: Sequence[str], patterns: Sequence[str] | None) -> list[str]:
@@ -50,42 +48,46 @@ def matching(source: str, names: Sequence[str], patterns: Sequence[str] | None) 
     return [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 
-def read_bag(path: StrPath, odom: str | None = None, advance: Callable[[int], object] = int) -> Bag:
+def read_bag(path: StrPath | Sequence[StrPath], odom: str | None = None, advance: Callable[[int], object] = int) -> Bag:
     """Read every message's arrival time, size and topic, and the poses of one topic.
 
     Args:
-        path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file (see `splits`).
-        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``), of one
-            publisher alone (``TOPIC@2``).
+        path: an MCAP file, a ROS 1 bag, a rosbag2 folder or ``.db3`` file (see `splits`); several are read as one, in
+            order of time, and named after the first.
+        odom: topic to take poses from, of one frame alone (``TOPIC:FRAME``; for tf, ``TOPIC:PARENT:CHILD``, also over
+            a chain of transforms, with those of ``/tf_static``), of one publisher alone (``TOPIC@2``).
         advance: called with 1 for each message read, as a progress bar's update.
 
     Raises:
-        TraceError: missing, not a recording, cut off, damaged, more than 10**7 messages or 10**4 topics, unpacking to
-            too much (see `bag_files`), of log times that cannot be true (see `clocks`).
+        TraceError: missing, not a recording, cut off, damaged, more than 10**4 topics, unpacking to too much (see
+            `bag_files`), of log times that cannot be true (see `clocks`).
         BufgymError: the extra ``ros`` is not installed; ``odom`` is no topic or carries no poses.
     """
-    files = splits(Path(path))
+    files = splits(path)
+    if not isinstance(path, str | PathLike):
+        path = path[0] if len(path) == 1 else files[0].path
     collector = None if odom is None else PoseCollector(path, odom)
     types: dict[str, str] = {}  # of every topic, also of those without messages
-    times, sizes = LogTimes(path), array("q")
+    times, sizes, seams = LogTimes(path), array("q"), Seams()
     for file, (channel, logged_ns, data) in split_messages(files, types):
         if len(types) > MAX_TOPICS:
             raise fault(path, f"more than {MAX_TOPICS} topics: must be fewer")
-        if len(sizes) >= MAX_BAG_MESSAGES:
-            raise fault(path, f"more than {MAX_BAG_MESSAGES} messages: must be fewer")
         with damage_errors(file, f"message {len(sizes) + 1} on {channel.topic} is "):
             times.add(channel, logged_ns, data)
+            seams.add(file, logged_ns)
             sizes.append(max(1, len(data)))
-            if collector is not None and channel.topic == collector.topic:
+            if collector is not None and collector.wants(channel.topic):
                 collector.add(file, channel, logged_ns, data)
         advance(1)
+    seams.said(path)
     order, size_bytes = times.order(), np.array(sizes, np.int64)
     topics = {name: types.get(name, "") for name in sorted({*types, *times.topics})}
     places = {name: k for k, name in enumerate(topics)}
     place = np.array([places[name] for name in times.topics], np.int64)
     topic = place[times.topic[order]]
     warn_of_shared_times(path, times.time_ns[order], topic, list(topics))
-    bag = Bag(str(path), files[0].kind, topics, times.time_ns[order], size_bytes[order], topic, order)
+    time_ns = times.time_ns[order]
+    bag = Bag(str(path), files[0].kind, topics, time_ns, size_bytes[order], topic, order, files=tuple(files))
     if collector is None:
         return bag
     from_ns, poses = collector.poses(topics)
@@ -101,7 +103,7 @@ def messages(bag: Bag) -> Iterator[Message]:
     ranks = np.argsort(bag.place).tolist()
     held: dict[int, Message] = {}
     due = 0
-    for rank, (_, message) in zip(ranks, split_messages(splits(Path(bag.path)), {}), strict=False):
+    for rank, (_, message) in zip(ranks, split_messages(list(bag.files), {}), strict=False):
         held[rank] = message
         while due in held:
             channel, _, data = held.pop(due)

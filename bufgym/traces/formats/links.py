@@ -20,6 +20,7 @@ from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
 from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
+from bufgym.traces.formats.recipes import Recipe, read_link, recipes
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
@@ -45,6 +46,13 @@ def _cells(*patterns: str, between: str = r"\s+") -> Callable[[str], object]:
     return lambda text: re.fullmatch(between.join(patterns), text)
 
 
+def _by_recipe(recipe: Recipe) -> Format:
+    """The format of another tool."""
+    return Format(
+        recipe.about, recipe.first.fullmatch, lambda path, *column: read_link(path, recipe, *column), recipe.columns
+    )
+
+
 FORMATS: Final[dict[str, Format]] = {
     "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
     "csv": Format(f"header {tables.CSV_HEADER}", lambda text: is_header(text, tables.CSV_HEADER), tables.read_csv),
@@ -61,10 +69,18 @@ FORMATS: Final[dict[str, Format]] = {
     "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
     "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3, DIRECTIONS),
     "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
+    **{name: _by_recipe(recipe) for name, recipe in recipes("links").items() if not recipe.says},
 }
 
 
-def read_trace(path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None) -> Trace:
+def read_trace(
+    path: StrPath,
+    format: str | None = None,
+    after: After = "loop",
+    *,
+    column: str | None = None,
+    columns: tables.Columns | None = None,
+) -> Trace:
     """Read a bandwidth trace.
 
     Args:
@@ -73,6 +89,7 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         after: as in `Trace`.
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
             run 1, the default, run 2, ...; `iperf3 --bidir`: upload, the default, or download).
+        columns: of any other table, which columns hold time and rate; without `format` and `column`.
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.
@@ -83,18 +100,27 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
     """
     origin = "requested"
     refuse_recording(path, "must be a bandwidth trace")
+    if columns is not None:
+        if format is not None or column is not None:
+            raise BufgymError("columns of a table go without format and column")
+        about = f"columns {columns.time} and {columns.rate} in {columns.unit}"
+        return _trace(path, tables.read_table(path, columns), after, about)
     if format is None:
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(FORMATS)}")
-    columns = FORMATS[format].columns
-    if column is not None and not columns:
+    choices = FORMATS[format].columns
+    if column is not None and not choices:
         raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
-    if column is not None and column not in columns:
-        raise BufgymError(f"column = {column!r}: must be one of {', '.join(columns)}")
+    if column is not None and column not in choices:
+        raise BufgymError(f"column = {column!r}: must be one of {', '.join(choices)}")
     chosen = () if column is None else (column,)
-    time_us, cumulative_bytes, note = FORMATS[format].read(path, *chosen)
-    source = f"{path} (format {format}, {origin}{', ' if note else ''}{note})"
+    return _trace(path, FORMATS[format].read(path, *chosen), after, f"format {format}, {origin}")
+
+
+def _trace(path: StrPath, knots: Knots, after: After, about: str) -> Trace:
+    time_us, cumulative_bytes, note = knots
+    source = f"{path} ({about}{', ' if note else ''}{note})"
     try:
         return Trace(trace_name(path), time_us, cumulative_bytes, after, source)
     except BufgymError as error:
@@ -111,9 +137,12 @@ def detect_format(path: StrPath) -> str:
     if len(names) > 1:
         rule = f"fits more than one format ({', '.join(names)}): say which with format=... (command line: --format)"
         raise line.error(line.text, rule)
+    for recipe in recipes("links").values():
+        if recipe.says and recipe.first.fullmatch(line.text):
+            raise fault(path, recipe.says)
     if not names:
         layouts = "; ".join(f"{name}: {format.layout}" for name, format in FORMATS.items())
-        raise line.misfit(f"must fit a known format ({layouts})")
+        raise line.misfit(f"must fit a known format ({layouts}), or name its columns: {tables.NAMED}")
     return names[0]
 
 

@@ -37,11 +37,15 @@ def read_mahimahi(path: StrPath) -> Knots:
     if stamps_ms is None:
         with open_text(path) as file:
             stamps_ms = _parsed_by_line(file)
+    if stamps_ms.size and stamps_ms[-1] == 0:
+        raise fault(path, "the last time must be after ms 0", value=0, field="time in ms")
+    return packets_at(path, np.maximum(stamps_ms, 1))
+
+
+def packets_at(path: StrPath, stamps_ms: Int64Array) -> Knots:
+    """The capacity of packets at these times, from ms 1 on."""
     if not stamps_ms.size:
         raise fault(path, "is empty: must hold a line for each packet")
-    if stamps_ms[-1] == 0:
-        raise fault(path, "the last time must be after ms 0", value=0, field="time in ms")
-    stamps_ms = np.maximum(stamps_ms, 1)
     is_last = np.append(stamps_ms[1:] != stamps_ms[:-1], True)
     return _knots(stamps_ms[is_last], np.flatnonzero(is_last) + 1)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.links import trace_name
+from bufgym.traces.formats.pose_tables import PoseColumns
 from bufgym.traces.formats.rows import read_rows
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, Line, decimals, is_header, open_text, write_text
@@ -25,6 +26,7 @@ def read_motion(
     *,
     format: str | None = None,
     times: StrPath | None = None,
+    columns: PoseColumns | None = None,
     advance: Callable[[int], object] = int,
 ) -> Motion:
     """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.
@@ -38,11 +40,17 @@ def read_motion(
     refuse_recording(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
-    if first is not None and format is None and times is None and is_header(first.text, MOTION_HEADER):
+    if (
+        first is not None
+        and format is None
+        and times is None
+        and columns is None
+        and is_header(first.text, MOTION_HEADER)
+    ):
         rows = read_rows(path, _motion_row, skip=first.number, read_block=_motion_block, advance=advance)
         moved, source = rows.values[:, 0] - rows.values[0, 0], f"{path} ({MOTION_HEADER}{rows.note})"
         return Motion(trace_name(path), rows.time_us, moved, source)
-    poses = read_poses(path, format=format, times=times, advance=advance)
+    poses = read_poses(path, format=format, times=times, columns=columns, advance=advance)
     source = f"{path} (trajectory, format {poses.format})"
     return motion_from_poses(poses, settings, name=trace_name(path), source=source)
 

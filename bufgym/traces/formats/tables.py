@@ -1,16 +1,24 @@
 """Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
 
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final, Literal
+from typing import Final
 
 from bufgym.traces.formats.faults import StrPath
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.text import Line, is_header, open_text, split_cells
+from bufgym.traces.formats.recipes import unit_named
+from bufgym.traces.formats.text import NUMBER, Line, is_header, open_text, split_cells
+from bufgym.traces.formats.units import UNIT_S
 from bufgym.traces.trace import US_PER_S
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.units import rate_of
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
 MAX_MBIT_PER_S: Final = 10**6
+NAMED: Final = "--time COL --rate COL --unit kB/s (read_trace(columns=Columns(...)))"
 _TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
 _RATE_COLUMNS: Final = {"bytes_per_s": 1e-6, "mbps": 0.125, "mbit/s": 0.125, "kbps": 125e-6, "kbit/s": 125e-6}
 """Name of a rate's column -> bytes per microsecond of its unit."""
@@ -46,33 +54,109 @@ def read_belgium(path: StrPath) -> Knots:
 def read_mbit(path: StrPath) -> Knots:
     """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
     with open_text(path) as file:
-        return held_rates(path, (_rate(line, None, "Mbit/s", 0.125) for line in file.lines()))
+        cells = ((line, line.columns(2)) for line in file.lines())
+        return held_rates(path, (_rate(line, time, rate, "Mbit/s", 0.125) for line, (time, rate) in cells))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns of a table hold what: each by its name in the header, or by its number from 1."""
+
+    time: str
+    rate: str
+    unit: str = "bit/s"
+    """Of the rate: B/s, kB/s, Mbit/s, ..."""
+    time_unit: str = ""
+    """s, ms, us or ns; by default that in the time's name, else s."""
 
 
 def fits_rates(text: str) -> bool:
-    """Whether a header names a time and a rate, as `time_s,bytes_per_s` and `time,mbps` do."""
-    time, *rate = split_cells(text.lower())
-    return time in _TIME_COLUMNS and len(rate) == 1 and rate[0] in _RATE_COLUMNS
+    """Whether a header names one time and one rate, as `time_s,bytes_per_s` and `time,mbps` do."""
+    names = split_cells(text.lower())
+    return [sum(name in known for name in names) for known in (_TIME_COLUMNS, _RATE_COLUMNS)] == [1, 1]
 
 
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
         header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-        column = split_cells(header.lower())[1]
-        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column]) for line in lines))
+        names = split_cells(header.lower())
+        time, rate = (
+            next(k for k, name in enumerate(names) if name in known) for known in (_TIME_COLUMNS, _RATE_COLUMNS)
+        )
+        unit = _RATE_COLUMNS[names[rate]]
+        cells = ((line, line.columns(len(names), ",")) for line in lines)
+        return held_rates(path, (_rate(line, of[time], of[rate], names[rate], unit) for line, of in cells))
 
 
-def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:
+def read_table(path: StrPath, columns: Columns) -> Knots:
+    """A table whose columns are named, by the rules of `held_rates`; cells lie between commas, semicolons or blanks."""
+    bytes_per_s = rate_of(f"1{columns.unit}")
+    if bytes_per_s is None:
+        raise BufgymError(f"unit = {columns.unit!r}: must be B/s or bit/s, with k, M or G before it")
+    with open_text(path) as file:
+        return held_rates(path, _table_rates(file.lines(), columns, bytes_per_s / US_PER_S))
+
+
+def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
+    for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
+        time_unit = columns.time_unit or unit_named(names[0]) or "s"
+        if time_unit not in UNIT_S:
+            raise BufgymError(f"time_unit = {time_unit!r}: must be one of {', '.join(UNIT_S)}")
+        yield _rate(line, time, rate, names[1], unit, UNIT_S[time_unit])
+
+
+def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
+    """Each line of a table with its cells in these columns, and the columns' names."""
+    places, names, count, separator = list[int](), list[str](), 0, ""
+    for line in lines:
+        if not count:
+            separator = separator_of(line.text)
+            header = cells_of(line.text.lstrip("#"), separator)
+            count = len(header)
+            places = [place_of(line, header, name) for name in wanted]
+            names = [header[k] for k in places]
+            if not all(re.fullmatch(NUMBER, header[k]) or date_us(header[k]) for k in places):
+                continue
+        if line.text.startswith("#"):
+            continue
+        cells = cells_of(line.text, separator)
+        if len(cells) != count:
+            raise line.error(line.text, f"must have {count} columns, has {len(cells)}")
+        yield line, [cells[k] for k in places], names
+
+
+def separator_of(text: str) -> str:
+    """What stands between the cells of a line; empty for blanks."""
+    return next((mark for mark in ";,\t" if mark in text), "")
+
+
+def cells_of(text: str, separator: str) -> list[str]:
+    """The cells of a line, without quotes; between semicolons, commas are decimal points."""
+    if separator == ";":
+        text = text.replace(",", ".")  # decimal commas
+    cells = [cell.strip().strip('"') for cell in text.split(separator or None)]
+    return cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells
+
+
+def place_of(line: Line, header: list[str], name: str) -> int:
+    """The place of a column that is named, or numbered from 1."""
+    if name in header:
+        return header.index(name)
+    if name.isdecimal() and 1 <= int(name[:6]) <= len(header):
+        return int(name) - 1
+    raise line.error(None, f"has no column {name!r}: must be one of {', '.join(header)[:300]}, or a number from 1")
+
+
+def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_s: float = 1.0) -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
-    time, rate = line.columns(2, separator)
-    start_us = _date_us(time) if separator else None
+    start_us = date_us(time)
     if start_us is None:
-        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S) * US_PER_S)
+        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S / time_s) * time_s * US_PER_S)
     return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
 
 
-def _date_us(text: str) -> int | None:
+def date_us(text: str) -> int | None:
     """Microseconds since 1970 of an ISO date, in UTC where it names no zone; None for other text."""
     try:
         date = datetime.fromisoformat(text if "-" in text else "")

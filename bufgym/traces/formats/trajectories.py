@@ -17,7 +17,7 @@ import re
 from collections.abc import Callable, Iterator
 from decimal import Decimal
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -28,7 +28,10 @@ from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_t
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
-from bufgym.utils.errors import BufgymError
+from bufgym.utils.errors import BufgymError, TraceError
+
+if TYPE_CHECKING:
+    from bufgym.traces.formats.pose_tables import PoseColumns
 
 POSE_FORMATS: Final = ("tum", "euroc", "kitti")
 
@@ -47,7 +50,12 @@ PLAIN: Final = b"0123456789+-.eE, \t\r\n"  # A block of other bytes is read line
 
 
 def read_poses(
-    path: StrPath, *, format: str | None = None, times: StrPath | None = None, advance: Callable[[int], object] = int
+    path: StrPath,
+    *,
+    format: str | None = None,
+    times: StrPath | None = None,
+    columns: "PoseColumns | None" = None,
+    advance: Callable[[int], object] = int,
 ) -> Poses:
     """Read a trajectory, plain or gzip'd; the first time becomes 0.
 
@@ -55,6 +63,7 @@ def read_poses(
         path: the file.
         format: one of `POSE_FORMATS`, with times in its own unit; by default both are found (see above).
         times: KITTI's file of times; by default the file of the same name with ``_times`` beside it.
+        columns: of any other table, which columns hold what; without `format` and `times`.
         advance: called with the number of lines just read, as a progress bar's update.
 
     Raises:
@@ -63,9 +72,19 @@ def read_poses(
             decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more.
         BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
+    from bufgym.traces.formats.pose_tables import read_pose_table
+
+    if columns is not None and (format is not None or times is not None):
+        raise BufgymError("columns of a table go without format and times")
+    if format is None and times is None and (table := read_pose_table(path, columns, advance)) is not None:
+        rows, about = table
+        normalize(rows.values[:, 3:])
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{about}{rows.note}")
+        warn_of_leaps(path, poses)
+        return poses
     unit = _OWN_UNIT.get(format or "", "s")
     if format is None:
-        format, unit = _detected(path)
+        format, unit = _detected(path, (8, 11, 12, 17))
     if format not in POSE_FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
@@ -83,8 +102,8 @@ def read_poses(
     return poses
 
 
-def _detected(path: StrPath) -> tuple[str, str]:
-    """The format and the unit of the times that the file's first lines fit."""
+def _detected(path: StrPath, counts: tuple[int, ...]) -> tuple[str, str]:
+    """The format and the unit of the times that the file's first lines fit; they have so many columns."""
     times: list[float] = []
     columns, blanks, named, decimals = 0, False, None, 0
     with open_text(path) as file:
@@ -95,6 +114,8 @@ def _detected(path: StrPath) -> tuple[str, str]:
             cells = _cells(line)
             if not columns:
                 columns, blanks = len(cells), "," not in line.text
+                if columns not in counts:
+                    raise _miscounted(line, columns, "8 columns (or 11 or 17 of a state estimate)")
             if (columns == 12 and blanks) or len(times) == _TIMES_READ or not re.fullmatch(NUMBER, cells[0]):
                 break
             times.append(float(cells[0]))
@@ -125,10 +146,16 @@ def _pose_row(format: str, unit: str) -> RowReader:
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = _cells(line)
         if len(cells) not in columns:
-            raise line.misfit(f"must have 8 columns{more}, has {len(cells)}")
-        return cells[0], _time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
+            raise line.misfit(
+                f"must have 8 columns{more}, has {len(cells)}: name them with --time COL --pose X Y Z QX QY QZ QW"
+            )
+        return cells[0], time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
 
     return row
+
+
+def _miscounted(line: Line, columns: int, right: str) -> TraceError:
+    return line.misfit(f"must have {right}, has {columns}: name them with --time COL --pose X Y Z QX QY QZ QW")
 
 
 def _pose_block(format: str, unit: str) -> BlockReader:
@@ -162,7 +189,12 @@ def _pose_block(format: str, unit: str) -> BlockReader:
     return block
 
 
-def _time_us(line: Line, text: str, unit: str) -> int:
+def is_number(text: str) -> bool:
+    """Whether a cell is a plain number."""
+    return re.fullmatch(NUMBER, text) is not None
+
+
+def time_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
@@ -189,7 +221,7 @@ def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:
 
 def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callable[[int], object]) -> Poses:
     times = _times_beside(path) if times is None else times
-    stamps = _read_times(times, unit or _detected(times)[1])
+    stamps = _read_times(times, unit or _detected(times, (1,))[1])
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = line.columns(12)
@@ -214,7 +246,7 @@ def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:
     with open_text(path) as file:
         for line in file.lines():
             (text,) = line.columns(1)
-            yield text, _time_us(line, text, unit)
+            yield text, time_us(line, text, unit)
 
 
 def _times_beside(path: StrPath) -> Path:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault, warn
-from bufgym.traces.trace import Float64Array
+from bufgym.traces.trace import Float64Array, Int64Array
 
 UNIT_S: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
@@ -21,6 +21,8 @@ _USUAL_STEPS_S: Final = (0.9e-3, SLOW_STEP_S)  # From one pose to the next, wher
 _LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
 _GAP_S: Final = 1.05  # From one pose to the next, with some jitter: longer ones are gaps
 _SHARED: Final = 0.1  # Where more samples share a time, the mean step counts
+_TOGETHER: Final = 10  # Samples of a burst, at most
+_BURST: Final = 20  # Times the median step that samples in bursts are apart on average
 _DECIMALS: Final = 4  # Clocks that count in ms have fewer
 _FRAMES: Final = 10  # Poses from which on whole numbers in a row look like frame numbers
 _LEAST_SAMPLE_S: Final = 1e-3  # No tool measures a link more often
@@ -95,8 +97,16 @@ def _step(times: Float64Array) -> float | None:
     above = steps[(steps > 0) & np.isfinite(steps)]
     if not len(above):
         return None
+    if len(times) > 2 * _TOGETHER and (of_bursts := steady_step(times)) > _BURST * np.median(above):
+        return of_bursts
     share = len(above) / len(steps)
     return float(np.median(above)) * (share if share < 1 - _SHARED else 1)
+
+
+def steady_step(times: Float64Array | Int64Array) -> float:
+    """Median step over several samples together, so that samples in bursts count by the time between bursts."""
+    count = min(_TOGETHER, len(times) - 1)
+    return float(np.median(times[count:] - times[:-count])) / count
 
 
 def _is_dated(first: float, step: float, unit: str) -> bool:
