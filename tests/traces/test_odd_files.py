@@ -32,6 +32,9 @@ RIGHT: list[tuple[str, Any, str | None]] = [
     ("dst_slow.csv", (3605, 125_000 * 3603 + 250_000 * 2), "line 5: 2024-03-31 03:00:00 is 3601 s after the line"),
     ("ip_stream.json", (3, 375_000), None),
     ("cooked_epoch.txt", (10, 125_000 * 19), None),
+    # Bytes, not bits: 10 MB/s for 10 s.
+    ("MBps.csv", (10, 100_000_000), None),
+    ("KBps.csv", (10, 100_000_000), None),
 ]
 """File; seconds, and x or bytes at the end, or the error; the warning."""
 
@@ -203,6 +206,16 @@ def test_an_hour_that_comes_twice_is_said(tmp_path: Path) -> None:
     ):
         assert read_trace(written(tmp_path, "time,mbps\n" + lines)).duration_us == 4 * 3600 * 10**6
     assert read_trace(written(tmp_path, "0 8\n1 8\n1 8\n2 8\n")).duration_us == 3 * 10**6
+
+
+@pytest.mark.parametrize(("unit", "rate"), [("Mbps", 125_000), ("mbps", 125_000), ("kB/s", 1000), ("KBps", 1000)])
+def test_b_is_a_bit_and_capital_b_a_byte(tmp_path: Path, unit: str, rate: int) -> None:
+    assert read_trace(written(tmp_path, f"time,{unit}\n0,2\n1,2\n")).total_bytes == 4 * rate
+    refuse(
+        "unit of the rate = 'MBPS': b is a bit and B a byte: must be as Mbps or MBps",
+        read_trace,
+        written(tmp_path, "time,MBPS\n0,2\n1,2\n"),
+    )
 
 
 def test_a_comma_at_the_end_of_each_line_begins_no_column(tmp_path: Path) -> None:

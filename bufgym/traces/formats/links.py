@@ -18,7 +18,7 @@ from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
-from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
+from bufgym.traces.formats.logs import NYU_UNITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
 from bufgym.traces.formats.splits import refuse_recording
@@ -54,7 +54,7 @@ FORMATS: Final[dict[str, Format]] = {
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format(
         "number,unit with a unit such as Mbits/sec",
-        _cells(NUMBER, f"(?:{'|'.join(NYU_BITS)}),?", between=r"\s*,\s*"),
+        _cells(NUMBER, f"(?:{'|'.join(NYU_UNITS)}),?", between=r"\s*,\s*"),
         read_nyu,
     ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),

@@ -3,17 +3,17 @@
 from datetime import UTC, datetime
 from typing import Final, Literal
 
-from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
 from bufgym.traces.formats.text import Line, is_header, open_text, split_cells
 from bufgym.traces.trace import US_PER_S
+from bufgym.utils.units import RATES
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
 MAX_MBIT_PER_S: Final = 10**6
 _TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
-_RATE_COLUMNS: Final = {"bytes_per_s": 1e-6, "mbps": 0.125, "mbit/s": 0.125, "kbps": 125e-6, "kbit/s": 125e-6}
-"""Name of a rate's column -> bytes per microsecond of its unit."""
+_RATE_NAMES: Final = {name.lower() for name in RATES}
 
 # 2286-11-20, the last epoch in ms with 13 digits.
 _MAX_EPOCH_MS: Final = 10**13
@@ -52,15 +52,17 @@ def read_mbit(path: StrPath) -> Knots:
 def fits_rates(text: str) -> bool:
     """Whether a header names a time and a rate, as `time_s,bytes_per_s` and `time,mbps` do."""
     time, *rate = split_cells(text.lower())
-    return time in _TIME_COLUMNS and len(rate) == 1 and rate[0] in _RATE_COLUMNS
+    return time in _TIME_COLUMNS and len(rate) == 1 and rate[0] in _RATE_NAMES
 
 
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
         header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-        column = split_cells(header.lower())[1]
-        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column]) for line in lines))
+        column = split_cells(header)[1]
+        if column not in RATES:
+            raise fault(path, "b is a bit and B a byte: must be as Mbps or MBps", value=column, field="unit of the rate")
+        return held_rates(path, (_rate(line, ",", column, RATES[column] / US_PER_S) for line in lines))
 
 
 def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:
