@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import columns
+from bufgym.cli.options import Holes, columns
 from bufgym.utils.errors import BufgymError, TraceError, printable
 from bufgym.utils.libraries import library
 
@@ -30,15 +30,19 @@ Column = Annotated[
     ),
 ]
 
+Outages = Annotated[
+    Holes | None, Parameter(help="Stretches without samples: hold the rate before (default), send nothing, or refuse.")
+]
 
-def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+
+def info(files: Files, /, *, format: Format = None, column: Column = None, holes: Outages = None) -> int:
     """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
 
     failed = 0
     for k, name in enumerate(files):
         try:
-            trace = traces.load(name, format, column=column)
+            trace = traces.load(name, format, column=column, holes=holes or "hold")
         except TraceError as error:
             failed += 1
             print(f"bufgym: error: {error}", file=sys.stderr)
@@ -48,18 +52,21 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
             for key, number in traces.describe(trace).items()
         ]
         knots = ("knots", f"{len(trace.time_us)}")
-        print("\n" * (k > failed) + f"{printable(trace.name)}\n{columns([('source', trace.source), knots, *lines])}")
+        print(
+            "\n" * (k > failed)
+            + f"{printable(trace.name)}\n{columns([('source', trace.source), *trace.sheet.facts, knots, *lines])}"
+        )
     return 2 if failed else 0
 
 
-def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+def validate(files: Files, /, *, format: Format = None, column: Column = None, holes: Outages = None) -> int:
     """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
 
     failed = 0
     for name in files:
         try:
-            trace = traces.load(name, format, column=column)
+            trace = traces.load(name, format, column=column, holes=holes or "hold")
         except TraceError as error:
             failed += 1
             print(f"error  {error}")
@@ -71,7 +78,16 @@ def validate(files: Files, /, *, format: Format = None, column: Column = None) -
     return 1 if failed else 0
 
 
-def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:
+def convert(
+    files: Files,
+    /,
+    *,
+    out: Path,
+    to: str | None = None,
+    format: Format = None,
+    column: Column = None,
+    holes: Outages = None,
+) -> None:
     """Write bandwidth traces in another format and name the loss.
 
     Args:
@@ -85,7 +101,7 @@ def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format
         option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
         raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
     for name, target in _targets(files, out, to):
-        trace = traces.load(name, format, column=column)
+        trace = traces.load(name, format, column=column, holes=holes or "hold")
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
         print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
@@ -108,7 +124,7 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
     return targets
 
 
-def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
+def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None, holes: Outages = None) -> None:
     """Draw bandwidth traces (needs the extra 'plot').
 
     Args:
@@ -119,7 +135,7 @@ def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = 
     figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
-    loaded = [traces.load(name, format, column=column) for name in files]
+    loaded = [traces.load(name, format, column=column, holes=holes or "hold") for name in files]
     figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):

@@ -10,7 +10,7 @@ from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
-from bufgym.traces.trace import After, Trace
+from bufgym.traces.trace import After, Holes, Trace
 from bufgym.utils import files
 from bufgym.utils.units import rate_of
 
@@ -47,7 +47,12 @@ def shipped() -> dict[str, Path]:
 
 
 def load(
-    name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
+    name_or_path: StrPath,
+    format: str | None = None,
+    after: After = "loop",
+    *,
+    column: str | None = None,
+    holes: Holes = "hold",
 ) -> Trace:
     """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
 
@@ -59,7 +64,7 @@ def load(
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:
         return replace(steady(rate), name=os.fspath(name_or_path))
-    return read_trace(_resolve(name_or_path), format, after, column=column)
+    return read_trace(_resolve(name_or_path), format, after, column=column, holes=holes)
 
 
 def load_motion(name_or_path: StrPath) -> Motion:

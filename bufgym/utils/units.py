@@ -11,7 +11,7 @@ _PER_S = {"bit/s": 0.125, "bits/sec": 0.125, "bps": 0.125, "B/s": 1.0, "Bps": 1.
 
 RATES = {
     "bytes_per_s": 1.0,
-    **{letter + name: 1000.0**_POWERS[letter] * size for letter in _POWERS for name, size in _PER_S.items()},
+    **{letter + name: 1000.0 ** _POWERS[letter] * size for letter in _POWERS for name, size in _PER_S.items()},
     "mbps": 125_000.0,
     "mbit/s": 125_000.0,
 }

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
 from bufgym.traces.formats.definitions import BagTopic, ros_type
+from bufgym.traces.formats.faults import warn
 from bufgym.utils.files import unpacked_limit
 
 if TYPE_CHECKING:
@@ -104,6 +105,10 @@ def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
                         declared(records.Schema.read(ReadDataStream(io.BytesIO(content))))
                     elif kind == Opcode.CHANNEL:
                         declared(records.Channel.read(ReadDataStream(io.BytesIO(content))))
+        if left := len(file.read()):
+            warn(
+                path, f"{left:,} bytes follow its end and are not read: files joined by cat? give the parts one by one"
+            )
 
 
 def _ours_may_end(records: Iterator[Any], file: _Bounded) -> Iterator[Any]:

@@ -122,7 +122,7 @@ class PoseCollector:
             raise BufgymError(f"{self.path}: odom = {self.topic!r} has 1 pose{count}: needs at least 2")
         note = left_out.said(self.path, f"poses on {self.topic}", "pose")
         positions, quaternions = values[last, :3], unit(values[last, 3:])
-        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{note}")
+        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{note}", from_ns // 1000)
 
     def _of_one_publisher(self, frames: Frames) -> tuple[Int64Array, Float64Array]:
         """Times in ns and values of the poses in these frames, in order of time.

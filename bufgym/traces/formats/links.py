@@ -10,12 +10,13 @@ interval, 10**6 Mbit/s. `text.py` has the limits of text files.
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
+from bufgym.traces import plausible
 from bufgym.traces.formats import tables
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
 from bufgym.traces.formats.logs import NYU_UNITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
@@ -23,9 +24,12 @@ from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
-from bufgym.traces.trace import After, Trace
+from bufgym.traces.sheet import Sheet, time_facts
+from bufgym.traces.trace import US_PER_S, After, Holes, Trace
 from bufgym.utils.errors import BufgymError, TraceError
 
+_DIRECTION: Final = re.compile("DL_|UL_|download|upload")  # in the note of a format
+_SIDES: Final = {"dl": "download", "do": "download", "ul": "upload", "up": "upload"}
 _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 
 
@@ -64,7 +68,9 @@ FORMATS: Final[dict[str, Format]] = {
 }
 
 
-def read_trace(path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None) -> Trace:
+def read_trace(
+    path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None, holes: Holes = "hold"
+) -> Trace:
     """Read a bandwidth trace.
 
     Args:
@@ -73,6 +79,8 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
         after: as in `Trace`.
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
             run 1, the default, run 2, ...; `iperf3 --bidir`: upload, the default, or download).
+        holes: in a stretch without samples (`plausible.holes`) "hold" the rate before it, send nothing ("zero"), or
+            "refuse" the file.
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.
@@ -93,12 +101,24 @@ def read_trace(path: StrPath, format: str | None = None, after: After = "loop", 
     if column is not None and column not in columns:
         raise BufgymError(f"column = {column!r}: must be one of {', '.join(columns)}")
     chosen = () if column is None else (column,)
-    time_us, cumulative_bytes, note = FORMATS[format].read(path, *chosen)
-    source = f"{path} (format {format}, {origin}{', ' if note else ''}{note})"
-    try:
-        return Trace(trace_name(path), time_us, cumulative_bytes, after, source)
-    except BufgymError as error:
-        raise TraceError(f"{path}: {error}") from error
+    if holes not in get_args(Holes):
+        raise BufgymError(f"holes = {holes!r}: must be one of {', '.join(get_args(Holes))}")
+    with heard() as doubts:
+        time_us, cumulative_bytes, note, start_us, ends = FORMATS[format].read(path, *chosen)
+        source = f"{path} (format {format}, {origin}{', ' if note else ''}{note})"
+        try:
+            trace = Trace(trace_name(path), time_us, cumulative_bytes, after, source)
+        except BufgymError as error:
+            raise TraceError(f"{path}: {error}") from error
+        if ends:
+            trace = plausible.over_holes(path, trace, ends, time_us[:-1], holes)
+    facts = time_facts("samples", time_us if format == "mahimahi" else time_us[:-1], start_us)
+    side = _DIRECTION.search(note)
+    facts += (("direction", _SIDES[side[0][:2].lower()] if side else "not said in the file"),)
+    if trace.holes:
+        lost_s = sum(end - start for start, end in trace.holes) / US_PER_S
+        facts += (("holes", f"{len(trace.holes)}, {lost_s:,.6g} s in all: {holes}"),)
+    return replace(trace, sheet=Sheet(facts, tuple(doubts)))
 
 
 def detect_format(path: StrPath) -> str:

@@ -6,13 +6,14 @@ from typing import Final, Literal
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
 from bufgym.traces.formats.text import Line, is_header, open_text, split_cells
+from bufgym.traces.formats.units import TIME_COLUMNS, UNIT_S
 from bufgym.traces.trace import US_PER_S
 from bufgym.utils.units import RATES
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
 MAX_MBIT_PER_S: Final = 10**6
-_TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
+_TIME_COLUMNS: Final = {"time_s": "", "time": "", "timestamp": "", "date": ""} | TIME_COLUMNS
 _RATE_NAMES: Final = {name.lower() for name in RATES}
 
 # 2286-11-20, the last epoch in ms with 13 digits.
@@ -59,18 +60,22 @@ def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
         header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-        column = split_cells(header)[1]
+        time, column = split_cells(header)
+        unit = _TIME_COLUMNS[time.lower()]
         if column not in RATES:
-            raise fault(path, "b is a bit and B a byte: must be as Mbps or MBps", value=column, field="unit of the rate")
-        return held_rates(path, (_rate(line, ",", column, RATES[column] / US_PER_S) for line in lines))
+            rule = "b is a bit and B a byte: must be as Mbps or MBps"
+            raise fault(path, rule, value=column, field="unit of the rate")
+        rates = (_rate(line, ",", column, RATES[column] / US_PER_S, unit or "s") for line in lines)
+        return held_rates(path, rates, unit=unit)
 
 
-def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:
+def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float, time_unit: str = "s") -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
     time, rate = line.columns(2, separator)
     start_us = _date_us(time) if separator else None
     if start_us is None:
-        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S) * US_PER_S)
+        unit_s = UNIT_S[time_unit]
+        start_us = round(line.decimal(f"time in {time_unit}", time, 0, _MAX_EPOCH_S / unit_s) * unit_s * US_PER_S)
     return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
 
 

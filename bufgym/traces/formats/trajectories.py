@@ -26,6 +26,7 @@ from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
+from bufgym.traces.plausible import check_slow_poses
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.utils.errors import BufgymError
@@ -63,7 +64,7 @@ def read_poses(
             decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more.
         BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
-    unit = _OWN_UNIT.get(format or "", "s")
+    unit, named = _OWN_UNIT.get(format or "", "s"), format is not None
     if format is None:
         format, unit = _detected(path)
     if format not in POSE_FORMATS:
@@ -78,7 +79,9 @@ def read_poses(
         )
         note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
         normalize(rows.values[:, 3:])
-        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}")
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}", rows.start_us)
+    if unit == "s" and format == "tum" and not named:
+        check_slow_poses(path, poses)
     warn_of_leaps(path, poses)
     return poses
 
@@ -126,7 +129,7 @@ def _pose_row(format: str, unit: str) -> RowReader:
         cells = _cells(line)
         if len(cells) not in columns:
             raise line.misfit(f"must have 8 columns{more}, has {len(cells)}")
-        return cells[0], _time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
+        return cells[0], time_in_us(line, cells[0], unit), _pose(line, cells[1:8], names)
 
     return row
 
@@ -162,7 +165,7 @@ def _pose_block(format: str, unit: str) -> BlockReader:
     return block
 
 
-def _time_us(line: Line, text: str, unit: str) -> int:
+def time_in_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
@@ -207,14 +210,14 @@ def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callab
         raise fault(times, f"holds more times than {path} has poses")
     matrices = rows.values.reshape(-1, 3, 4)
     format = f"kitti, times from {Path(times).name}{rows.note}"
-    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format)
+    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format, rows.start_us)
 
 
 def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:
     with open_text(path) as file:
         for line in file.lines():
             (text,) = line.columns(1)
-            yield text, _time_us(line, text, unit)
+            yield text, time_in_us(line, text, unit)
 
 
 def _times_beside(path: StrPath) -> Path:

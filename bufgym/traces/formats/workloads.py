@@ -9,17 +9,21 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces import plausible
+from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.motions import coordinate
 from bufgym.traces.formats.rows import check_order
 from bufgym.traces.formats.text import open_text, split_cells, write_text
-from bufgym.traces.formats.trajectories import seconds
+from bufgym.traces.formats.trajectories import time_in_us
+from bufgym.traces.formats.units import TIME_COLUMNS
+from bufgym.traces.sheet import Sheet, time_facts
 from bufgym.traces.trace import US_PER_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES, MAX_MESSAGES, Workload
 from bufgym.utils.errors import BufgymError
 
 WORKLOAD_HEADERS: Final = ("time_s,bytes", "time_s,bytes,topic", "time_s,bytes,x", "time_s,bytes,topic,x")
+_UNITS: Final = {"time_s": "s", **TIME_COLUMNS}
 
 
 def read_workload_csv(path: StrPath) -> Workload:
@@ -30,19 +34,22 @@ def read_workload_csv(path: StrPath) -> Workload:
             that are not whole numbers from 1 to 10**10, an empty topic, more than 10**7 messages.
     """
     with open_text(path) as file:
-        known = map(split_cells, WORKLOAD_HEADERS)
+        known = [split_cells(header)[1:] for header in WORKLOAD_HEADERS]
         header, lines = file.below_header(
-            "the header time_s,bytes[,topic][,x]", lambda text: split_cells(text) in known
+            "the header time_s,bytes[,topic][,x]",
+            lambda text: split_cells(text)[0] in _UNITS and split_cells(text)[1:] in known,
         )
-        titles = split_cells(header)
+        time_column, *titles = split_cells(header)
+        unit, whole = _UNITS[time_column], True
         times, sizes, numbers, xs = array("q"), array("q"), array("q"), array("d")
         topics: dict[str, int] = {}
         for line in lines:
-            cells = dict(zip(titles, line.columns(len(titles), ","), strict=True))
+            time, *rest = line.columns(len(titles) + 1, ",")
+            cells = dict(zip(titles, rest, strict=True))
             if len(times) >= MAX_MESSAGES:
                 raise line.error(None, f"must be one of at most {MAX_MESSAGES} messages")
-            time_us = seconds(line, cells["time_s"])
-            check_order(line, "time_s", cells["time_s"], time_us, times)
+            time_us, whole = time_in_us(line, time, unit), whole and time.isdigit()
+            check_order(line, time_column, time, time_us, times)
             times.append(time_us)
             sizes.append(line.whole("bytes", cells["bytes"], MAX_MESSAGE_BYTES))
             if not sizes[-1]:
@@ -55,10 +62,15 @@ def read_workload_csv(path: StrPath) -> Workload:
                 xs.append(coordinate(line, "x", cells["x"], xs[-1] if xs else 0.0))
     if not times:
         raise fault(path, "holds no message: must hold at least one")
+    with heard() as doubts:
+        if unit == "s" and whole:
+            plausible.check_seconds(path, np.asarray(times) / US_PER_S, refuse_ms=True)
+        plausible.warn_of_pauses(path, np.asarray(times) - times[0])
     arrival_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
     x_from_0 = np.array(xs, np.float64) - xs[0] if xs else None
-    source = f"{path} ({','.join(titles)})"
-    return Workload(trace_name(path), arrival_us - arrival_us[0], size, number, tuple(topics), x_from_0, source)
+    source = f"{path} ({header.strip()})"
+    sheet = Sheet(time_facts("messages", arrival_us - times[0], times[0]), tuple(doubts))
+    return Workload(trace_name(path), arrival_us - times[0], size, number, tuple(topics), x_from_0, source, sheet=sheet)
 
 
 def write_workload_csv(workload: Workload, path: StrPath) -> None:
