@@ -226,7 +226,7 @@ def _uplink(stream: StreamOptions, measured: MotionOptions) -> Described:
         settings["motion"] = _motions(stream.motion, measured)
     if stream.motion == ["none"]:
         settings = {"value": qoi.exponential(), **settings}
-    scenario = scenarios.get("lte", **settings)
+    scenario: Any = scenarios.get("lte", **settings)
     named = [*(scenario.traces if stream.trace else ()), *(scenario.motion if stream.motion else ())]
     facts = [
         f"{printable(one.name)}: {'; '.join(f'{name} {value}' for name, value in one.sheet.facts)}"

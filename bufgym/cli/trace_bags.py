@@ -57,8 +57,8 @@ class RecordingOptions(MotionOptions):
     the message's index)."""
     bridge_gaps: bool = False
     """Take motion across gaps in it as even."""
-    clock: Literal["log", "stamps"] | None = None
-    """Arrivals by a recording's log times (default), or by the clock of its header stamps."""
+    clock: str | None = None
+    """Arrivals by a recording's log times ("log", the default), or by the clock of its header stamps ("stamps")."""
 
     def arguments(self) -> dict[str, Any]:
         """Collect those given for ``read_workload``; motion options need odometry."""

@@ -79,7 +79,9 @@ def workload_from_bag(
         if distant and (bag.poses is None or bridge_gaps):
             warn(bag.path, distant)
         elif not distant:
-            plausible.warn_of_pauses(bag.path, (time_ns - time_ns[0]) // 1000)
+            # Of all topics, as one alone may send now and then.
+            meanwhile = bag.time_ns[(bag.time_ns >= time_ns[0]) & (bag.time_ns <= time_ns[-1])]
+            plausible.warn_of_pauses(bag.path, (meanwhile - time_ns[0]) // 1000)
         x, gaps, facts = _motion_at(time_ns, bag, settings, bridge_gaps, distant)
     facts = (*time_facts("messages", (time_ns - time_ns[0]) // 1000, int(time_ns[0]) // 1000), *bag.sheet.facts, *facts)
     measured = ""
