@@ -15,6 +15,7 @@ counts how often each speaks in real recordings.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -126,7 +127,8 @@ def _is_whole(value: float) -> bool:
 
 def over_holes(path: StrPath, trace: Trace, ends: Sequence[tuple[int, str]], time_us: Int64Array, policy: str) -> Trace:
     """The trace with its holes, as the ``policy`` says; ``ends`` are line and time at the end of each interval."""
-    found = holes(time_us)
+    # A rate of 0 before a hole says the same either way.
+    found = [hole for hole in holes(time_us) if trace.rate_bytes_per_s(hole.start_us) > 0]
     if not found:
         return trace
     longest = max(found, key=lambda hole: hole.end_us - hole.start_us)
@@ -139,7 +141,7 @@ def over_holes(path: StrPath, trace: Trace, ends: Sequence[tuple[int, str]], tim
     hole = f"{time} is {hole_s:.10g} s after the line above{count}, where {usual_s:g} s is usual"
     if policy == "refuse":
         raise fault(path, f"{hole}: say --holes hold, or --holes zero (holes='zero')", line=line)
-    held = trace.with_holes("hold", tuple((hole.start_us, hole.end_us) for hole in found))
+    held = replace(trace, holes=tuple((hole.start_us, hole.end_us) for hole in found))
     empty = held.with_holes("zero")
     means = {"hold": f"{held.mean_bytes_per_s / 1e3:,.6g} KB/s", "zero": f"{empty.mean_bytes_per_s / 1e3:,.6g} KB/s"}
     done, other = ("nothing is sent", "hold") if policy == "zero" else ("the rate is held", "zero")

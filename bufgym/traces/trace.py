@@ -191,19 +191,17 @@ class Trace:
         cumulative = np.rint(self.cumulative_bytes * factor).astype(np.int64)
         return replace(self, cumulative_bytes=cumulative, source=f"{self.source} x {factor:g}".strip())
 
-    def with_holes(self, how: Holes, holes: tuple[tuple[int, int], ...] | None = None) -> Trace:
-        """The trace with the rate before each of these ``holes``, by default its own, held in it, or nothing sent."""
-        holes = self.holes if holes is None else holes
-        starts_us, ends_us = (np.array(column, np.int64) for column in zip(*holes, strict=True)) if holes else ([], [])
-        time_us = np.union1d(self.time_us, np.concatenate([starts_us, ends_us])).astype(np.int64)
+    def with_holes(self, how: Holes) -> Trace:
+        """The trace with the rate before each hole held in it, or nothing sent."""
+        time_us = np.union1d(self.time_us, np.array(self.holes, np.int64).ravel())
         cumulative = np.rint(np.interp(time_us, self.time_us, self.cumulative_bytes)).astype(np.int64)
         counts = cumulative[1:] - cumulative[:-1]
-        for start_us, end_us in holes:
+        for start_us, end_us in self.holes:
             first, last = np.searchsorted(time_us, [start_us, end_us])
             lengths_us = np.diff(time_us[first - 1 : last + 1])
             rate = 0.0 if how == "zero" else counts[first - 1] / lengths_us[0]
             counts[first:last] = np.rint(rate * lengths_us[1:])
-        return replace(self, time_us=time_us, cumulative_bytes=_from_zero(counts), holes=holes)
+        return replace(self, time_us=time_us, cumulative_bytes=_from_zero(counts))
 
     @classmethod
     def from_intervals(
