@@ -123,7 +123,9 @@ def bench(
     if suite.suite is not None:
         print(done.plain)
     else:
-        print(f"\n{done.plain}" if experiment.recorded else done)
+        print(
+            done.about.removeprefix(experiment.arguments["about"]) + f"\n{done.plain}" if experiment.recorded else done
+        )
     if experiment.recorded:
         _print_drops(done, entrants, experiment, capacity, drops)
     if mcap is not None:
@@ -174,13 +176,13 @@ def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], com
 def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
     from bufgym.benchmark.tasks import task_for
 
-    scenario, lines, label, recorded = options.scenario(asked_seeds)
+    scenario, lines, label, recorded, facts = options.scenario(asked_seeds)
     if task_for(scenario).kind != "queue":
         refuse(given(buffer), "is for one queue")
     of_a_queue = given(buffer, "max_bytes", "decide_at") | ({"bound": False} if buffer.no_bound else {})
     task = task_for(scenario, **of_a_queue)
     seeds = asked_seeds or (1 if recorded else task.seeds)
-    about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds)]
+    about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds), *facts]
     arguments = {"seeds": seeds, "label": label, "about": "\n".join(about)}
     return Experiment(scenario, task, {**arguments, **of_a_queue}, recorded)
 

@@ -29,6 +29,13 @@ class Poses:
     """float64[n, 4], unit; any order of the four, q and -q being the same orientation."""
     format: str = ""
     """What they were read from."""
+    start_us: int = 0
+    """Time 0 by the recording's clock, microseconds."""
+
+    def path_m(self) -> float:
+        """Length of the way from pose to pose, m."""
+        steps = (np.linalg.norm(np.diff(piece.position_m, axis=0), axis=1).sum() for piece in self.pieces())
+        return float(sum(steps))
 
     def at(self, time_us: Int64Array) -> Poses:
         """The poses at these times, int64[m] within the recording: position linear, orientation by slerp."""

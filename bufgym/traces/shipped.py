@@ -11,7 +11,7 @@ from bufgym.traces.formats.motions import read_motion
 from bufgym.traces.formats.tables import Columns
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
-from bufgym.traces.trace import After, Trace
+from bufgym.traces.trace import After, Holes, Trace
 from bufgym.utils import files
 from bufgym.utils.units import rate_of
 
@@ -54,6 +54,7 @@ def load(
     *,
     column: str | None = None,
     columns: Columns | None = None,
+    holes: Holes = "hold",
 ) -> Trace:
     """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
 
@@ -65,7 +66,7 @@ def load(
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:
         return replace(steady(rate), name=os.fspath(name_or_path))
-    return read_trace(_resolve(name_or_path), format, after, column=column, columns=columns)
+    return read_trace(_resolve(name_or_path), format, after, column=column, columns=columns, holes=holes)
 
 
 def load_motion(name_or_path: StrPath) -> Motion:

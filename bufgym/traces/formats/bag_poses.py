@@ -163,7 +163,7 @@ class PoseCollector:
         positions, quaternions = values[last, :3], unit(values[last, 3:])
         about = ", positions of a satellite receiver, no orientation" if self._is_fix else ""
         about = f", {' -> '.join([chain[0][0], *(child for _, child in chain)])}" if chain else about
-        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{about}{note}")
+        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{about}{note}", from_ns // 1000)
 
     def _chain(self) -> list[Frames]:
         """The transforms from the first frame asked for down to the second; empty if they are not connected."""

@@ -10,23 +10,27 @@ interval, 10**6 Mbit/s. `text.py` has the limits of text files.
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
+from bufgym.traces import plausible
 from bufgym.traces.formats import tables
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
-from bufgym.traces.formats.logs import NYU_BITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
+from bufgym.traces.formats.logs import NYU_UNITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.recipes import Recipe, read_link, recipes
 from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, is_header, open_text
-from bufgym.traces.trace import After, Trace
+from bufgym.traces.sheet import Sheet, time_facts
+from bufgym.traces.trace import US_PER_S, After, Holes, Trace
 from bufgym.utils.errors import BufgymError, TraceError
 
+_DIRECTION: Final = re.compile("DL_|UL_|download|upload")  # in the note of a format
+_SIDES: Final = {"dl": "download", "do": "download", "ul": "upload", "up": "upload"}
 _SUFFIXES: Final = (".csv", ".log", ".txt", ".dat", ".json", ".list", ".out")
 
 
@@ -62,7 +66,7 @@ FORMATS: Final[dict[str, Format]] = {
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "nyu": Format(
         "number,unit with a unit such as Mbits/sec",
-        _cells(NUMBER, f"(?:{'|'.join(NYU_BITS)}),?", between=r"\s*,\s*"),
+        _cells(NUMBER, f"(?:{'|'.join(NYU_UNITS)}),?", between=r"\s*,\s*"),
         read_nyu,
     ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
@@ -80,6 +84,7 @@ def read_trace(
     *,
     column: str | None = None,
     columns: tables.Columns | None = None,
+    holes: Holes = "hold",
 ) -> Trace:
     """Read a bandwidth trace.
 
@@ -90,6 +95,8 @@ def read_trace(
         column: the one to read, where a format has several (`ucc`: DL_bitrate, the default, or UL_bitrate; `runs`:
             run 1, the default, run 2, ...; `iperf3 --bidir`: upload, the default, or download).
         columns: of any other table, which columns hold time and rate; without `format` and `column`.
+        holes: in a stretch without samples (`plausible.holes`) "hold" the rate before it, send nothing ("zero"), or
+            "refuse" the file.
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.
@@ -98,33 +105,44 @@ def read_trace(
         TraceError: the file is missing, empty, damaged, of no known format, of two, or breaks a rule of its format.
         BufgymError: an unknown `format`, `after` or `column`.
     """
-    origin = "requested"
+    if holes not in get_args(Holes):
+        raise BufgymError(f"holes = {holes!r}: must be one of {', '.join(get_args(Holes))}")
     refuse_recording(path, "must be a bandwidth trace")
+    with heard() as doubts:
+        about, (time_us, cumulative_bytes, note, start_us, ends) = _knots(path, format, column, columns)
+        source = f"{path} ({about}{', ' if note else ''}{note})"
+        try:
+            trace = Trace(trace_name(path), time_us, cumulative_bytes, after, source)
+        except BufgymError as error:
+            raise TraceError(f"{path}: {error}") from error
+        if ends:
+            trace = plausible.over_holes(path, trace, ends, time_us[:-1], holes)
+    facts = time_facts("samples", time_us if about.startswith("format mahimahi") else time_us[:-1], start_us)
+    side = _DIRECTION.search(note)
+    facts += (("direction", _SIDES[side[0][:2].lower()] if side else "not said in the file"),)
+    if trace.holes:
+        lost_s = sum(end - start for start, end in trace.holes) / US_PER_S
+        facts += (("holes", f"{len(trace.holes)}, {lost_s:,.6g} s in all: {holes}"),)
+    return replace(trace, sheet=Sheet(facts, tuple(doubts)))
+
+
+def _knots(path: StrPath, format: str | None, column: str | None, columns: tables.Columns | None) -> tuple[str, Knots]:
+    """How the file is read, in words, and what it holds."""
     if columns is not None:
         if format is not None or column is not None:
             raise BufgymError("columns of a table go without format and column")
         about = f"columns {columns.time} and {columns.rate} in {columns.unit}"
-        return _trace(path, tables.read_table(path, columns), after, about)
+        return about, tables.read_table(path, columns)
+    origin = "requested"
     if format is None:
         format, origin = detect_format(path), "detected"
     elif format not in FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(FORMATS)}")
     choices = FORMATS[format].columns
-    if column is not None and not choices:
-        raise BufgymError(f"column = {column!r}: format {format} has no columns to choose from")
     if column is not None and column not in choices:
-        raise BufgymError(f"column = {column!r}: must be one of {', '.join(choices)}")
-    chosen = () if column is None else (column,)
-    return _trace(path, FORMATS[format].read(path, *chosen), after, f"format {format}, {origin}")
-
-
-def _trace(path: StrPath, knots: Knots, after: After, about: str) -> Trace:
-    time_us, cumulative_bytes, note = knots
-    source = f"{path} ({about}{', ' if note else ''}{note})"
-    try:
-        return Trace(trace_name(path), time_us, cumulative_bytes, after, source)
-    except BufgymError as error:
-        raise TraceError(f"{path}: {error}") from error
+        rule = f"must be one of {', '.join(choices)}" if choices else f"format {format} has no columns to choose from"
+        raise BufgymError(f"column = {column!r}: {rule}")
+    return f"format {format}, {origin}", FORMATS[format].read(path, *filter(None, [column]))
 
 
 def detect_format(path: StrPath) -> str:

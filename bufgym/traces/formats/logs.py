@@ -17,6 +17,7 @@ from bufgym.traces.formats.tables import MAX_MBIT_PER_S
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 from bufgym.utils import strict_json
+from bufgym.utils.units import RATES
 
 UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
 
@@ -27,7 +28,7 @@ MAX_UCC_STEP_S: Final = 5
 _MAX_KBIT_PER_S: Final = MAX_MBIT_PER_S * 1000
 _UCC_TIME: Final = "Timestamp"
 _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
-NYU_BITS: Final = {"bits/sec": 1, "Kbits/sec": 10**3, "Mbits/sec": 10**6, "Gbits/sec": 10**9}
+NYU_UNITS: Final = ("bits/sec", "Kbits/sec", "Mbits/sec", "Gbits/sec")
 _SHOWN_CHARACTERS: Final = 40
 _BLANKS: Final = re.compile(r"\s*")
 
@@ -83,10 +84,10 @@ def read_nyu(path: StrPath) -> Knots:
     with open_text(path) as file:
         for line in file.lines():
             value, unit = line.columns(2, ",")
-            if unit not in NYU_BITS:
-                raise line.error(unit, f"must be one of {', '.join(NYU_BITS)}", "unit")
-            most = MAX_MBIT_PER_S * 10**6 / NYU_BITS[unit]
-            intervals.add(US_PER_S, round(line.decimal(unit, value, 0, most) * NYU_BITS[unit] / 8))
+            if unit not in NYU_UNITS:
+                raise line.error(unit, f"must be one of {', '.join(NYU_UNITS)}", "unit")
+            most = MAX_MBIT_PER_S * 125_000 / RATES[unit]
+            intervals.add(US_PER_S, round(line.decimal(unit, value, 0, most) * RATES[unit]))
     return intervals.knots(path)
 
 

@@ -1,11 +1,12 @@
 """Motion from files: camera trajectories (see `trajectories`), or CSV of finished coordinates, header `t_s,motion`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.faults import StrPath, heard, warn
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.pose_tables import PoseColumns
 from bufgym.traces.formats.rows import read_rows
@@ -13,6 +14,7 @@ from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, Line, decimals, is_header, open_text, write_text
 from bufgym.traces.formats.trajectories import MAX_EPOCH_S, PLAIN, read_poses, seconds
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
+from bufgym.traces.sheet import Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 
 MOTION_HEADER: Final = "t_s,motion"
@@ -40,19 +42,20 @@ def read_motion(
     refuse_recording(path, "must be a trajectory (motion in it is taken with --odom)")
     with open_text(path) as file:
         first = next((line for line in file.lines() if not line.text.startswith("#")), None)
-    if (
-        first is not None
-        and format is None
-        and times is None
-        and columns is None
-        and is_header(first.text, MOTION_HEADER)
-    ):
-        rows = read_rows(path, _motion_row, skip=first.number, read_block=_motion_block, advance=advance)
+    chosen = format is not None or times is not None or columns is not None
+    if first is not None and not chosen and is_header(first.text, MOTION_HEADER):
+        with heard() as doubts:
+            rows = read_rows(path, _motion_row, skip=first.number, read_block=_motion_block, advance=advance)
         moved, source = rows.values[:, 0] - rows.values[0, 0], f"{path} ({MOTION_HEADER}{rows.note})"
-        return Motion(trace_name(path), rows.time_us, moved, source)
-    poses = read_poses(path, format=format, times=times, columns=columns, advance=advance)
-    source = f"{path} (trajectory, format {poses.format})"
-    return motion_from_poses(poses, settings, name=trace_name(path), source=source)
+        sheet = Sheet(time_facts("samples", rows.time_us, rows.start_us), tuple(doubts))
+        return Motion(trace_name(path), rows.time_us, moved, source, sheet=sheet)
+    with heard() as doubts:
+        poses = read_poses(path, format=format, times=times, columns=columns, advance=advance)
+        source = f"{path} (trajectory, format {poses.format})"
+        motion = motion_from_poses(poses, settings, name=trace_name(path), source=source)
+        for doubt in motion.sheet.doubts:
+            warn(path, doubt)
+    return replace(motion, sheet=Sheet(motion.sheet.facts, tuple(doubts)))
 
 
 def write_motion_csv(motion: Motion, path: StrPath) -> None:

@@ -16,7 +16,7 @@ from bufgym.traces.formats.recipes import Recipe, field_of, recipes, unit_named
 from bufgym.traces.formats.rows import RowReader, Rows, read_rows
 from bufgym.traces.formats.tables import cells_of, date_us, place_of, separator_of
 from bufgym.traces.formats.text import Line, open_text
-from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE, is_number, time_us
+from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE, is_number, time_in_us
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.trace import US_PER_S
 from bufgym.utils.errors import BufgymError
@@ -156,7 +156,7 @@ def _row(table: _Table) -> RowReader:
         norm = float(np.linalg.norm(quaternion))
         if abs(norm - 1) > NORM_TOLERANCE:
             raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
-        us = time_us(line, text, table.unit) if date is None else date
+        us = time_in_us(line, text, table.unit) if date is None else date
         return text, us, [*values, *([0.0] * (3 - len(values))), *quaternion]
 
     return row
@@ -195,4 +195,4 @@ def _recipe_row(recipe: Recipe) -> RowReader:
 def _in_metres(rows: Rows) -> Rows:
     values = rows.values.copy()
     values[:, :3] = local_plane(values[:, :3])
-    return Rows(rows.time_us, values, f", positions of a satellite receiver, no orientation{rows.note}")
+    return rows._replace(values=values, note=f", positions of a satellite receiver, no orientation{rows.note}")

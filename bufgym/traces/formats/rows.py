@@ -30,6 +30,7 @@ class Rows(NamedTuple):
     time_us: Int64Array  # int64[n], microseconds from 0, increasing
     values: Float64Array  # float64[n, columns]
     note: str  # what was left out and is not worth a warning; empty for nothing
+    start_us: int  # time 0 by the recording's clock, microseconds
 
 
 def read_rows(
@@ -143,7 +144,8 @@ class _Kept:
         if step_s > SLOW_STEP_S:
             warn(self._path, f"its {what} are {step_s:.6g} s apart (median): are the times in another unit?")
         note = left_out.said(self._path, what)
-        return Rows(time_us - time_us[0], np.frombuffer(self._values, np.float64).reshape(-1, self._columns), note)
+        values = np.frombuffer(self._values, np.float64).reshape(-1, self._columns)
+        return Rows(time_us - time_us[0], values, note, int(time_us[0]))
 
 
 def check_order(line: Line, field: str, text: str, time_us: int, times: Sequence[int]) -> None:

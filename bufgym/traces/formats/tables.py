@@ -6,22 +6,20 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final
 
-from bufgym.traces.formats.faults import StrPath
+from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.recipes import unit_named
+from bufgym.traces.formats.recipes import field_of, unit_named
 from bufgym.traces.formats.text import NUMBER, Line, is_header, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S
 from bufgym.traces.trace import US_PER_S
 from bufgym.utils.errors import BufgymError
-from bufgym.utils.units import rate_of
+from bufgym.utils.units import RATES
 
 CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
 MAX_MBIT_PER_S: Final = 10**6
 NAMED: Final = "--time COL --rate COL --unit kB/s (read_trace(columns=Columns(...)))"
-_TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
-_RATE_COLUMNS: Final = {"bytes_per_s": 1e-6, "mbps": 0.125, "mbit/s": 0.125, "kbps": 125e-6, "kbit/s": 125e-6}
-"""Name of a rate's column -> bytes per microsecond of its unit."""
+_RATE_NAMES: Final = {name.lower() for name in RATES}
 
 # 2286-11-20, the last epoch in ms with 13 digits.
 _MAX_EPOCH_MS: Final = 10**13
@@ -72,38 +70,41 @@ class Columns:
 
 def fits_rates(text: str) -> bool:
     """Whether a header names one time and one rate, as `time_s,bytes_per_s` and `time,mbps` do."""
-    names = split_cells(text.lower())
-    return [sum(name in known for name in names) for known in (_TIME_COLUMNS, _RATE_COLUMNS)] == [1, 1]
+    return _columns_named(text) is not None
+
+
+def _columns_named(text: str) -> Columns | None:
+    names = split_cells(text)
+    times = [name for name in names if field_of(name) == "time"]
+    rates = [name for name in names if name.lower() in _RATE_NAMES]
+    return Columns(times[0], rates[0], rates[0]) if len(times) == len(rates) == 1 else None
 
 
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
-        header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-        names = split_cells(header.lower())
-        time, rate = (
-            next(k for k, name in enumerate(names) if name in known) for known in (_TIME_COLUMNS, _RATE_COLUMNS)
-        )
-        unit = _RATE_COLUMNS[names[rate]]
-        cells = ((line, line.columns(len(names), ",")) for line in lines)
-        return held_rates(path, (_rate(line, of[time], of[rate], names[rate], unit) for line, of in cells))
+        header, _ = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
+    columns = _columns_named(header)
+    assert columns is not None
+    return read_table(path, columns)
 
 
 def read_table(path: StrPath, columns: Columns) -> Knots:
     """A table whose columns are named, by the rules of `held_rates`; cells lie between commas, semicolons or blanks."""
-    bytes_per_s = rate_of(f"1{columns.unit}")
-    if bytes_per_s is None:
-        raise BufgymError(f"unit = {columns.unit!r}: must be B/s or bit/s, with k, M or G before it")
+    if columns.unit not in RATES:
+        rule = "b is a bit and B a byte: must be as B/s, kB/s, MBps, kbit/s or Mbps"
+        raise fault(path, rule, value=columns.unit, field="unit of the rate")
+    if columns.time_unit not in ("", *UNIT_S):
+        raise BufgymError(f"time_unit = {columns.time_unit!r}: must be one of {', '.join(UNIT_S)}")
     with open_text(path) as file:
-        return held_rates(path, _table_rates(file.lines(), columns, bytes_per_s / US_PER_S))
+        return held_rates(path, _table_rates(file.lines(), columns, RATES[columns.unit] / US_PER_S))
 
 
 def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
     for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
-        time_unit = columns.time_unit or unit_named(names[0]) or "s"
-        if time_unit not in UNIT_S:
-            raise BufgymError(f"time_unit = {time_unit!r}: must be one of {', '.join(UNIT_S)}")
-        yield _rate(line, time, rate, names[1], unit, UNIT_S[time_unit])
+        # A column named time_s may hold anything.
+        named = columns.time_unit or unit_named(names[0]).removesuffix("s" if names[0] == "time_s" else "?")
+        yield _rate(line, time, rate, names[1], unit, named)
 
 
 def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
@@ -148,12 +149,15 @@ def place_of(line: Line, header: list[str], name: str) -> int:
     raise line.error(None, f"has no column {name!r}: must be one of {', '.join(header)[:300]}, or a number from 1")
 
 
-def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_s: float = 1.0) -> Rate:
+def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_unit: str = "") -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
     start_us = date_us(time)
     if start_us is None:
-        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S / time_s) * time_s * US_PER_S)
-    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
+        unit_s = UNIT_S[time_unit or "s"]
+        start_us = round(
+            line.decimal(f"time in {time_unit or 's'}", time, 0, _MAX_EPOCH_S / unit_s) * unit_s * US_PER_S
+        )
+    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit, time_unit)
 
 
 def date_us(text: str) -> int | None:

@@ -26,6 +26,7 @@ from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
+from bufgym.traces.plausible import check_slow_poses
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.utils.errors import BufgymError, TraceError
@@ -79,10 +80,10 @@ def read_poses(
     if format is None and times is None and (table := read_pose_table(path, columns, advance)) is not None:
         rows, about = table
         normalize(rows.values[:, 3:])
-        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{about}{rows.note}")
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{about}{rows.note}", rows.start_us)
         warn_of_leaps(path, poses)
         return poses
-    unit = _OWN_UNIT.get(format or "", "s")
+    unit, named = _OWN_UNIT.get(format or "", "s"), format is not None
     if format is None:
         format, unit = _detected(path, (8, 11, 12, 17))
     if format not in POSE_FORMATS:
@@ -97,7 +98,9 @@ def read_poses(
         )
         note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
         normalize(rows.values[:, 3:])
-        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}")
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}", rows.start_us)
+    if unit == "s" and format == "tum" and not named:
+        check_slow_poses(path, poses)
     warn_of_leaps(path, poses)
     return poses
 
@@ -146,10 +149,8 @@ def _pose_row(format: str, unit: str) -> RowReader:
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = _cells(line)
         if len(cells) not in columns:
-            raise line.misfit(
-                f"must have 8 columns{more}, has {len(cells)}: name them with --time COL --pose X Y Z QX QY QZ QW"
-            )
-        return cells[0], time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
+            raise _miscounted(line, len(cells), f"8 columns{more}")
+        return cells[0], time_in_us(line, cells[0], unit), _pose(line, cells[1:8], names)
 
     return row
 
@@ -194,7 +195,7 @@ def is_number(text: str) -> bool:
     return re.fullmatch(NUMBER, text) is not None
 
 
-def time_us(line: Line, text: str, unit: str) -> int:
+def time_in_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
@@ -239,14 +240,14 @@ def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callab
         raise fault(times, f"holds more times than {path} has poses")
     matrices = rows.values.reshape(-1, 3, 4)
     format = f"kitti, times from {Path(times).name}{rows.note}"
-    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format)
+    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format, rows.start_us)
 
 
 def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:
     with open_text(path) as file:
         for line in file.lines():
             (text,) = line.columns(1)
-            yield text, time_us(line, text, unit)
+            yield text, time_in_us(line, text, unit)
 
 
 def _times_beside(path: StrPath) -> Path:

@@ -9,14 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces import plausible
+from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.motions import coordinate
 from bufgym.traces.formats.recipes import field_of, unit_named
 from bufgym.traces.formats.rows import check_order
 from bufgym.traces.formats.tables import date_us
 from bufgym.traces.formats.text import open_text, split_cells, write_text
-from bufgym.traces.formats.trajectories import time_us
+from bufgym.traces.formats.trajectories import time_in_us
+from bufgym.traces.sheet import Sheet, time_facts
 from bufgym.traces.trace import US_PER_S
 from bufgym.traces.workload import MAX_MESSAGE_BYTES, Workload
 from bufgym.utils.errors import BufgymError
@@ -35,15 +37,16 @@ def read_workload_csv(path: StrPath) -> Workload:
     """
     with open_text(path) as file:
         header, lines = file.below_header("the header time_s,bytes[,topic][,x], or name a time and bytes", _fields)
-        titles, unit = _fields(header), _unit(header)
+        titles, unit, whole = _fields(header), _unit(header), True
         times, sizes, numbers, xs = array("q"), array("q"), array("q"), array("d")
         topics: dict[str, int] = {}
         for line in lines:
             cells = dict(zip(titles, line.columns(len(titles), ","), strict=True))
-            date = date_us(cells["time_s"])
-            arrival_us = time_us(line, cells["time_s"], unit) if date is None else date
-            check_order(line, "time_s", cells["time_s"], arrival_us, times)
-            times.append(arrival_us)
+            time, date = cells["time_s"], date_us(cells["time_s"])
+            time_us = time_in_us(line, time, unit) if date is None else date
+            whole = whole and time.isdigit()
+            check_order(line, "time_s", time, time_us, times)
+            times.append(time_us)
             sizes.append(line.whole("bytes", cells["bytes"], MAX_MESSAGE_BYTES))
             if not sizes[-1]:
                 raise line.error(cells["bytes"], "must be at least 1", "bytes")
@@ -55,10 +58,15 @@ def read_workload_csv(path: StrPath) -> Workload:
                 xs.append(coordinate(line, "x", cells["x"], xs[-1] if xs else 0.0))
     if not times:
         raise fault(path, "holds no message: must hold at least one")
-    arrivals_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
+    with heard() as doubts:
+        if unit == "s" and whole:
+            plausible.check_seconds(path, np.asarray(times) / US_PER_S, refuse_ms=True)
+        plausible.warn_of_pauses(path, np.asarray(times) - times[0])
+    arrival_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
     x_from_0 = np.array(xs, np.float64) - xs[0] if xs else None
     source = f"{path} ({','.join(split_cells(header))})"
-    return Workload(trace_name(path), arrivals_us - arrivals_us[0], size, number, tuple(topics), x_from_0, source)
+    sheet = Sheet(time_facts("messages", arrival_us - times[0], times[0]), tuple(doubts))
+    return Workload(trace_name(path), arrival_us - times[0], size, number, tuple(topics), x_from_0, source, sheet=sheet)
 
 
 def _fields(header: str) -> list[str]:
