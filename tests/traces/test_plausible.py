@@ -128,12 +128,6 @@ def test_header_stamps_tell_the_clock(tmp_path: Path) -> None:
     refuse("clock = 'wall': must be one of log, stamps", read_workload, path, clock="wall")
 
 
-def test_bytes_behind_the_end_are_said(tmp_path: Path) -> None:
-    pytest.importorskip("mcap", reason=needs("extras", "mcap"))
-    with pytest.warns(TraceWarning, match=r"cat2.mcap: 77,722 bytes follow its end and are not read"):
-        assert len(read_workload(unpacked(tmp_path, "cat2.mcap"))) == 100
-
-
 def test_a_pause_of_messages_is_said(tmp_path: Path) -> None:
     times = [*range(100), *range(7299, 7399)]
     lines = "".join(f"{time}.0,9\n" for time in times)

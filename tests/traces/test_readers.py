@@ -136,7 +136,7 @@ def test_columns_of_any_table(tmp_path: Path) -> None:
         columns=Columns("c", "b"),
     )
     refuse("line 3: 0*1,1,1: must have 2 columns, has 3", read_trace, path, columns=Columns("a", "b"))
-    refuse("unit = 'furlongs': must be B/s or bit/s", read_trace, path, columns=Columns("a", "b", "furlongs"))
+    refuse("unit of the rate = furlongs: b is a bit and B a byte: must be as Mbps or MBps", read_trace, path, columns=Columns("a", "b", "furlongs"))
     refuse("time_unit = 'h': must be one of s, ms, us, ns", read_trace, path, columns=Columns("a", "b", time_unit="h"))
     refuse("go without format and column", read_trace, path, "mbit", columns=Columns("a", "b"))
     refuse(r"line 1: a,b: must fit a known format .*, or name its columns: --time COL --rate COL", read_trace, path)

@@ -92,7 +92,7 @@ def read_rates(path: StrPath) -> Knots:
 def read_table(path: StrPath, columns: Columns) -> Knots:
     """A table whose columns are named, by the rules of `held_rates`; cells lie between commas, semicolons or blanks."""
     if columns.unit not in RATES:
-        rule = "b is a bit and B a byte: must be as B/s, kB/s, MBps, kbit/s or Mbps"
+        rule = "b is a bit and B a byte: must be as Mbps or MBps"
         raise fault(path, rule, value=columns.unit, field="unit of the rate")
     if columns.time_unit not in ("", *UNIT_S):
         raise BufgymError(f"time_unit = {columns.time_unit!r}: must be one of {', '.join(UNIT_S)}")
@@ -123,7 +123,7 @@ def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[
             continue
         cells = cells_of(line.text, separator)
         if len(cells) != count:
-            raise line.error(line.text, f"must have {count} columns, has {len(cells)}")
+            raise line.misfit(f"must have {count} columns, has {len(cells)}")
         yield line, [cells[k] for k in places], names
 
 
