@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.jit import kernel
-from bufgym.traces.plausible import doubt_of_noise
+from bufgym.traces.plausible import NOISE, NOISE_POSES, doubt_of_noise
 from bufgym.traces.poses import Poses, angles, gaps_between, longest_s, unit
 from bufgym.traces.sheet import NONE, Facts, Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
@@ -157,22 +157,27 @@ def motion_from_poses(
         poses = replace(poses, quaternion=unit(poses.quaternion))
     turned, moved = _steps(poses, settings)
     motion = Motion(name, poses.time_us, np.append(0.0, np.cumsum(turned + moved)), source, gaps)
-    halved = Poses(poses.time_us[::2], poses.position_m[::2], poses.quaternion[::2])
-    share = float(motion_steps(halved, settings).sum()) / motion.total if motion.total > 0 else 1.0
-    doubt = doubt_of_noise(share, motion.total, len(poses.time_us))
+    shares = {} if not motion.total else {k: _share(poses, settings, k) / motion.total for k in _compared(poses)}
+    doubt = doubt_of_noise(shares, motion.total)
     facts = _facts(recorded, motion, settings, turned, moved)
-    share_fact = ("x of every second", f"{share:.2f} of x, of {len(poses.time_us):,} poses compared")
+    share_fact = ("x of every second", f"{shares.get(2, 1):.2f} of x, of {len(poses.time_us):,} poses compared")
     return replace(motion, sheet=Sheet((*facts, share_fact), (doubt,) if doubt else ()))
 
 
-def motion_steps(poses: Poses, settings: MotionSettings) -> Float64Array:
-    """Motion from each pose to the next, float64[n-1]: rotation / field of view + translation / scene scale."""
-    turned, moved = _steps(poses, settings)
-    return turned + moved
+def _compared(poses: Poses) -> list[int]:
+    """Every how many poses x is summed again: those of the noise rule that are at most a second, and 2."""
+    most = US_PER_S / float(np.median(np.diff(poses.time_us)))
+    return [k for k in NOISE if k == min(NOISE) or k <= most] if len(poses.time_us) >= NOISE_POSES else []
+
+
+def _share(poses: Poses, settings: MotionSettings, k: int) -> float:
+    """Motion by every ``k``-th pose alone."""
+    some = Poses(poses.time_us[::k], poses.position_m[::k], poses.quaternion[::k])
+    return float(sum(part.sum() for part in _steps(some, settings)))
 
 
 def _steps(poses: Poses, settings: MotionSettings) -> tuple[Float64Array, Float64Array]:
-    """Both parts of ``motion_steps``."""
+    """Rotation / field of view and translation / scene scale from each pose to the next, float64[n-1] each."""
     turned = [angles(piece.quaternion[:-1], piece.quaternion[1:]) for piece in poses.pieces()]
     moved = [np.linalg.norm(np.diff(piece.position_m, axis=0), axis=1) for piece in poses.pieces()]
     return np.concatenate(turned) / math.radians(settings.fov_deg), np.concatenate(moved) / settings.scene_scale_m

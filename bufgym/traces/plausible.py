@@ -10,7 +10,9 @@ counts how often each speaks in real recordings.
 | clock | every number is HHMMSS, and as a clock the steps are even that are not as seconds | GPS receivers |
 | days | days since 1899 | spreadsheets |
 | slow poses | poses 0.9 s apart or more that move at less than 1 cm/s, and in ms at a usual speed | times in ms |
-| noise | x of every second pose is less than 0.75 of x: of noise it is 0.5, of real motion 0.88 and more | UWB, RTK |
+| noise | x of every second pose is less than 0.75 of x, or of every third to eighth within 1 s less than 0.6: of real \
+motion they are 0.88 and 0.78 or more, of noise 1/2 to 1/8 | UWB, RTK, two sources in one stream |
+| jumps | a pose more than 1 m away, at more than 50 m/s, also in a usual step of at most 0.1 s | lost localisation |
 | stamps | header stamps go on by less than 0.9 or more than 1.1 s in a second of log time | simulators, other units |
 """
 
@@ -40,9 +42,11 @@ _SERIAL_DAYS: Final = (36_526, 58_074)  # Days since 1899-12-30, as spreadsheets
 
 SLOW_POSES_S: Final = 0.9
 SLOW_M_PER_S: Final = 0.01
-FAST_M_PER_S: Final = 50.0
+FAST_M_PER_S: Final = 50
+_STANDS_M: Final = 1.0  # Shorter ways are no jump at any speed: two poses may be logged within microseconds
+_MOST_USUAL_S: Final = 0.1  # So may a car's of a usual step each, which came in a burst; but a slow topic jumps, too
 
-NOISE: Final = 0.75
+NOISE: Final = {2: 0.75, **dict.fromkeys(range(3, 9), 0.6)}  # Every how many poses -> least share of x
 NOISE_POSES: Final = 50  # Fewer do not tell
 
 STAMP_RATES: Final = (0.9, 1.1)
@@ -173,14 +177,34 @@ def check_slow_poses(path: StrPath, poses: "Poses") -> None:
         raise fault(path, rule, value=f"{step_s:g}", field="median step of the times")
 
 
-def doubt_of_noise(share: float, x: float, poses: int) -> str:
-    """Doubt about motion of which every second pose has this share; "" for none."""
-    if poses < NOISE_POSES or not 0 < x or share >= NOISE:
+def doubt_of_noise(shares: dict[int, float], x: float) -> str:
+    """Doubt about motion of which every second, third, ... pose alone has these shares; "" for none."""
+    k = next((k for k, share in shares.items() if share < NOISE[k]), 0)
+    if not k:
         return ""
-    noise = min(2 * (1 - share), 1)
+    noise = min((1 - shares[k]) * k / (k - 1), 1)
+    which = "second" if k == 2 else f"{k}th"
     return (
-        f"x of every second pose is {share:.2f} of x (real motion 0.88 and more, noise 0.5): about {noise:.0%} of x = "
-        f"{x:.3f} is noise of the positions (--rate-hz compares poses less often)"
+        f"x of every {which} pose is {shares[k]:.2f} of x (real motion 0.88 and more, noise 1/{k}): about {noise:.0%} "
+        f"of x = {x:.3f} is noise of the positions, or hops between two sources (--rate-hz compares poses less often)"
+    )
+
+
+def warn_of_jumps(path: StrPath, poses: "Poses") -> None:
+    """Warn of poses that no robot can reach from the pose before: localisation was lost, or numbers are wrong."""
+    moved_m = np.concatenate([np.linalg.norm(np.diff(piece.position_m, axis=0), axis=1) for piece in poses.pieces()])
+    step_s = np.diff(poses.time_us) / US_PER_S
+    usual_s = min(float(step_s.mean()), _MOST_USUAL_S)
+    jumps = np.flatnonzero((moved_m > _STANDS_M) & (moved_m > FAST_M_PER_S * np.maximum(step_s, usual_s)))
+    if not len(jumps):
+        return
+    k = int(jumps[0])
+    more = f", the first of {len(jumps)} jumps" if len(jumps) > 1 else ""
+    warn(
+        path,
+        f"pose {k + 2} of {len(poses.time_us)} ({poses.format}), {poses.time_us[k + 1] / US_PER_S:.3f} s after the "
+        f"first, is {moved_m[k]:.6g} m from the one {step_s[k]:.6g} s before{more}: no robot is faster than "
+        f"{FAST_M_PER_S} m/s, and x counts it as motion",
     )
 
 

@@ -15,8 +15,8 @@ from bufgym.traces.formats.bag_files import MAX_TOPICS, Message
 from bufgym.traces.formats.bag_poses import PoseCollector
 from bufgym.traces.formats.clocks import LogTimes, warn_of_shared_times
 from bufgym.traces.formats.faults import StrPath, fault, heard
-from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.splits import Seams, Split, damage_errors, split_messages, splits
+from bufgym.traces.plausible import warn_of_jumps
 from bufgym.traces.poses import Poses
 from bufgym.traces.sheet import NONE, Sheet
 from bufgym.traces.trace import Int64Array
@@ -117,7 +117,7 @@ def _read(path: StrPath | Sequence[StrPath], odom: str | None, advance: Callable
         poses = Poses(
             time_us[last], poses.position_m[last], poses.quaternion[last], poses.format, int(pose_ns[0]) // 1000
         )
-    warn_of_leaps(path, poses)
+    warn_of_jumps(path, poses)
     return replace(bag, poses=poses, poses_from_ns=from_ns)
 
 

@@ -13,6 +13,7 @@ from bufgym.traces.formats.text import NUMBER, Line
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array
 
 MAX_INTERVAL_BYTES: Final = 10**12
+MAX_MBIT_PER_S: Final = 10**6
 
 # A rate that would have to hold for longer is a gap in the recording, across which nothing is known.
 MAX_HOLD_S: Final = 86_400

@@ -19,12 +19,12 @@ from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
-from bufgym.traces.formats.logs import NYU_UNITS, UCC_COLUMNS, fits_ucc, read_nyu, read_sabre, read_ucc
+from bufgym.traces.formats.logs import UCC_COLUMNS, fits_ucc, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.recipes import Recipe, read_link, recipes
-from bufgym.traces.formats.speed_tests import INTERVAL, REMARK, RULER, RUN, RUNS, read_nuttcp, read_runs
+from bufgym.traces.formats.speed_tests import RULER, RUN, RUNS, read_runs
 from bufgym.traces.formats.splits import refuse_recording
-from bufgym.traces.formats.text import NUMBER, is_header, open_text
+from bufgym.traces.formats.text import NUMBER, open_text
 from bufgym.traces.sheet import Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, After, Holes, Trace
 from bufgym.utils.errors import BufgymError, TraceError
@@ -59,18 +59,10 @@ def _by_recipe(recipe: Recipe) -> Format:
 
 FORMATS: Final[dict[str, Format]] = {
     "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
-    "csv": Format(f"header {tables.CSV_HEADER}", lambda text: is_header(text, tables.CSV_HEADER), tables.read_csv),
     "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), tables.read_mbit),
-    "belgium": Format("six numbers", _cells(*[NUMBER] * 6), tables.read_belgium),
     "rates": Format(f"header {tables.RATES_HEADER} or time,mbps", tables.fits_rates, tables.read_rates),
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
-    "nyu": Format(
-        "number,unit with a unit such as Mbits/sec",
-        _cells(NUMBER, f"(?:{'|'.join(NYU_UNITS)}),?", between=r"\s*,\s*"),
-        read_nyu,
-    ),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
-    "nuttcp": Format("nuttcp's log", lambda text: INTERVAL.fullmatch(text) or REMARK.fullmatch(text), read_nuttcp),
     "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3, DIRECTIONS),
     "runs": Format("Run 1, or ###", lambda text: RUN.fullmatch(text) or RULER.fullmatch(text), read_runs, RUNS),
     **{name: _by_recipe(recipe) for name, recipe in recipes("links").items() if not recipe.says},

@@ -1,7 +1,6 @@
-"""Readers of the logs of measuring tools: UCC's 4G and 5G CSV (G-NetTrack Pro), NYU-METS (iPerf), Sabre's JSON.
+"""Readers of the logs of measuring tools: UCC's 4G and 5G CSV (G-NetTrack Pro), Sabre's JSON.
 
-Sources: UCC's 4G and 5G logs [raca2018beyond], [raca2020beyond]; NYU-METS, L. Mei et al., "Realtime Mobile Bandwidth
-Prediction using LSTM Neural Networks", PAM 2019 (extended: [mei2020realtime]); K. Spiteri et al., "From Theory to
+Sources: UCC's 4G and 5G logs [raca2018beyond], [raca2020beyond]; K. Spiteri et al., "From Theory to
 Practice: Improving Bitrate Adaptation in the DASH Reference Player", MMSys 2018.
 """
 
@@ -12,12 +11,10 @@ from datetime import datetime
 from typing import Any, Final
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.intervals import Intervals, Knots
-from bufgym.traces.formats.tables import MAX_MBIT_PER_S
+from bufgym.traces.formats.intervals import MAX_MBIT_PER_S, Intervals, Knots
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 from bufgym.utils import strict_json
-from bufgym.utils.units import RATES
 
 UCC_COLUMNS: Final = ("DL_bitrate", "UL_bitrate")
 
@@ -28,7 +25,6 @@ MAX_UCC_STEP_S: Final = 5
 _MAX_KBIT_PER_S: Final = MAX_MBIT_PER_S * 1000
 _UCC_TIME: Final = "Timestamp"
 _UCC_TIME_FORMAT: Final = "%Y.%m.%d_%H.%M.%S"
-NYU_UNITS: Final = ("bits/sec", "Kbits/sec", "Mbits/sec", "Gbits/sec")
 _SHOWN_CHARACTERS: Final = 40
 _BLANKS: Final = re.compile(r"\s*")
 
@@ -76,19 +72,6 @@ def _stamp(line: Line, text: str) -> datetime:
         return datetime.strptime(text, _UCC_TIME_FORMAT)
     except ValueError:
         raise line.error(text, "must be a time as 2019.12.16_13.40.04", _UCC_TIME) from None
-
-
-def read_nyu(path: StrPath) -> Knots:
-    """Each line is the rate of 1 s with its unit; bytes are rounded to whole numbers."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.lines():
-            value, unit = line.columns(2, ",")
-            if unit not in NYU_UNITS:
-                raise line.error(unit, f"must be one of {', '.join(NYU_UNITS)}", "unit")
-            most = MAX_MBIT_PER_S * 125_000 / RATES[unit]
-            intervals.add(US_PER_S, round(line.decimal(unit, value, 0, most) * RATES[unit]))
-    return intervals.knots(path)
 
 
 def read_sabre(path: StrPath) -> Knots:

@@ -11,15 +11,17 @@ from typing import Any, Final
 import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots
+from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, MAX_MBIT_PER_S, Intervals, Knots
 from bufgym.traces.formats.mahimahi import MAX_STAMP_MS, packets_at
 from bufgym.traces.formats.text import Line, open_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
 from bufgym.utils.files import read_toml
+from bufgym.utils.units import RATES
 
 _PREFIXES: Final = {"": 0, "K": 10, "M": 20, "G": 30}
 _MAX_COUNTER: Final = 2**63 - 1
 _MAX_EPOCH_S: Final = 10**11
+_OFF: Final = 0.02  # Share of a stated rate: the length is printed with two decimals
 _ROUNDED_S: Final = 0.11  # Edges of intervals are printed with one decimal, or more
 
 
@@ -103,7 +105,7 @@ def read_link(path: StrPath, recipe: Recipe, column: str | None = None) -> Knots
         return _packets(path, samples)
     if recipe.columns:
         return _counted(path, samples, column or recipe.columns[0])
-    return _intervals(path, samples)
+    return _intervals(path, recipe, samples)
 
 
 def _packets(path: StrPath, samples: Iterator[tuple[Line, dict[str, str]]]) -> Knots:
@@ -118,28 +120,44 @@ def _packets(path: StrPath, samples: Iterator[tuple[Line, dict[str, str]]]) -> K
     return packets_at(path, np.maximum(np.array(stamps_ms, np.int64), 1))
 
 
-def _intervals(path: StrPath, samples: Iterator[tuple[Line, dict[str, str]]]) -> Knots:
+def _intervals(path: StrPath, recipe: Recipe, samples: Iterator[tuple[Line, dict[str, str]]]) -> Knots:
     """Intervals that follow each other; of parallel streams, their sums. Totals over all of them are left out."""
-    found = list(samples)
-    ids = list(dict.fromkeys(groups["id"] for _, groups in found))
+    ids = list[str]()
+    if recipe.line is not None and "id" in recipe.line.groupindex:
+        samples = iter(found := list(samples))
+        ids = list(dict.fromkeys(groups["id"] for _, groups in found))
     if len(ids) > 1 and "SUM" not in ids:
         raise fault(path, f"holds streams {', '.join(ids[:8])} and no sum of them: must hold one, or lines of [SUM]")
-    intervals, end_s = Intervals(), None
-    for line, groups in found:
+    intervals, end_s, lost, sent = Intervals(), None, 0, 0
+    for line, groups in samples:
         if len(ids) > 1 and groups["id"] != "SUM":
             continue
-        start, end = (line.decimal(name, groups[name], 0, MAX_DURATION_S) for name in ("start", "end"))
-        if end_s is not None and start == 0 and end > end_s - _ROUNDED_S:
-            continue  # the total
-        if end_s is not None and abs(start - end_s) > _ROUNDED_S:
-            raise line.error(groups["start"], f"must begin where the line above ended ({end_s:g} s)", "start in s")
-        length_us = round((end - (start if end_s is None else end_s)) * US_PER_S)
-        if length_us <= 0:
-            raise line.error(groups["end"], "must be after its start", "end in s")
-        unit = 2 ** _PREFIXES[groups["prefix"]]
-        intervals.add(length_us, round(line.decimal("bytes", groups["bytes"], 0, MAX_INTERVAL_BYTES / unit) * unit))
-        end_s = end
-    return intervals.knots(path, f"{len(intervals)} intervals")
+        if "length_ms" in groups:
+            intervals.add_ending_at(line, groups["end_ms"], groups["length_ms"], groups["bytes"])
+            continue
+        length_us = round(line.decimal("sec", groups.get("length", "1"), 0.01, MAX_DURATION_S) * US_PER_S)
+        if "end" in groups:
+            start, end = (line.decimal(name, groups[name], 0, MAX_DURATION_S) for name in ("start", "end"))
+            if end_s is not None and start == 0 and end > end_s - _ROUNDED_S:
+                continue  # the total
+            if end_s is not None and abs(start - end_s) > _ROUNDED_S:
+                raise line.error(groups["start"], f"must begin where the line above ended ({end_s:g} s)", "start in s")
+            length_us = round((end - (start if end_s is None else end_s)) * US_PER_S)
+            if length_us <= 0:
+                raise line.error(groups["end"], "must be after its start", "end in s")
+            end_s = end
+        field, unit = "bytes", 2.0 ** _PREFIXES[groups.get("prefix", "")]
+        if "unit" in groups:
+            field, unit = groups["unit"], RATES[groups["unit"]]
+        count = round(line.decimal(field, groups["bytes"], 0, MAX_INTERVAL_BYTES / unit) * unit)
+        if "mbps" in groups:
+            stated, computed = line.decimal("Mbps", groups["mbps"], 0, MAX_MBIT_PER_S), count * 8 / length_us
+            if abs(stated - computed) > _OFF * computed + 0.01:
+                raise line.error(groups["mbps"], f"must be MB / sec, {computed:.4g}", "Mbps")
+        intervals.add(length_us, count)
+        lost, sent = lost + int(groups.get("lost", 0)), sent + int(groups.get("sent", 0))
+    udp = f", UDP, {lost:,} of {sent:,} packets lost" if sent else ""
+    return intervals.knots(path, f"{len(intervals)} intervals{udp}")
 
 
 def _counted(path: StrPath, samples: Iterator[tuple[Line, dict[str, str]]], column: str) -> Knots:

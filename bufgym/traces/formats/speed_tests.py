@@ -1,8 +1,6 @@
-"""Readers of speed tests: logs of nuttcp, and lists of runs. `iperf3` reads the JSON of iperf3.
+"""Reader of lists of speed tests: several runs in a file.
 
-Sources of the recordings that they were checked on: M. Ghoshal et al., "A First Large-Scale Study of Operational 5G
-Standalone Networks", CoNEXT 2025 (nuttcp); M. Ghoshal et al., "An In-Depth Study of Uplink Performance of 5G mmWave
-Networks", 5G-MeMU 2022 (lists).
+Checked on M. Ghoshal et al., "An In-Depth Study of Uplink Performance of 5G mmWave Networks", 5G-MeMU 2022.
 """
 
 import re
@@ -10,51 +8,9 @@ from collections.abc import Iterator
 from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES, Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.tables import MAX_MBIT_PER_S
+from bufgym.traces.formats.intervals import MAX_MBIT_PER_S, Knots, Rate, held_rates
 from bufgym.traces.formats.text import Line, open_text, split_cells
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S
-
-MAX_INTERVAL_S: Final = 3600  # Longest interval of a speed test, s; a longer one does not measure a changing link
-
-_STAMP: Final = r"(?:\[[0-9T:.+ -]+\] *)?"
-INTERVAL: Final = re.compile(_STAMP + r"([0-9.]+) +MB +/ +([0-9.]+) +sec += +([0-9.]+) +Mbps\b(?!.*%TX)(.*)")
-REMARK: Final = re.compile(_STAMP + r"(?:nuttcp(?:-[tr])?:.*|[0-9.]+ +MB +/.*%.*|(?:Start|End) time: *[0-9]+|)")
-_MBIT_PER_MB: Final = 2**20 * 8e-6
-_LOSS: Final = re.compile(r"(-?[0-9]+) +/ +([0-9]+) +~?drop/pkt")  # of a UDP test, packets lost and packets sent
-# The interval's length is printed with two decimals.
-_LENGTH_ERROR: Final = 0.02
-
-
-def read_nuttcp(path: StrPath) -> Knots:
-    """Lines `[time]  MB / s = Mbps ...` with remarks around them; MB are 2**20 bytes.
-
-    Intervals follow each other with the length that each line states: the stamps say when lines were printed, which
-    they are in bursts. A failed run ("error") is no recording, and is refused, as are rates that the bytes contradict.
-    Over UDP the bytes are those that the receiver got, and the note says how many packets were lost.
-    """
-    intervals, lost, sent = Intervals(), 0, 0
-    with open_text(path) as file:
-        for line in file.lines():
-            match = INTERVAL.fullmatch(line.text)
-            if match is None:
-                if "error" in line.text.lower():
-                    raise line.error(line.text, "must be a run that succeeded")
-                if not REMARK.fullmatch(line.text):
-                    raise line.error(line.text, "must be an interval, MB / sec = Mbps, or a remark of nuttcp")
-                continue
-            megabytes = line.decimal("MB", match[1], 0, MAX_INTERVAL_BYTES / 2**20)
-            length_s = line.decimal("sec", match[2], 0.01, MAX_INTERVAL_S)
-            stated = line.decimal("Mbps", match[3], 0, MAX_MBIT_PER_S)
-            computed = megabytes * _MBIT_PER_MB / length_s
-            if abs(stated - computed) > _LENGTH_ERROR * computed + 0.01:
-                raise line.error(match[3], f"must be MB / sec, {computed:.4g}", "Mbps")
-            intervals.add(round(length_s * US_PER_S), round(megabytes * 2**20))
-            if (loss := _LOSS.search(match[4])) is not None:
-                lost, sent = lost + int(loss[1]), sent + int(loss[2])
-    udp = f", UDP, {lost:,} of {sent:,} packets lost" if sent else ""
-    return intervals.knots(path, f"{len(intervals)} intervals{udp}")
-
 
 MAX_RUNS: Final = 16
 RUNS: Final = tuple(f"run {number}" for number in range(1, MAX_RUNS + 1))  # Values of `column`

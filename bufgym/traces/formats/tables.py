@@ -1,4 +1,4 @@
-"""Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
+"""Rates over time in tables: under a header that names them, in Mbit/s, or in columns that are chosen."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -7,53 +7,19 @@ from datetime import UTC, datetime
 from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
+from bufgym.traces.formats.intervals import MAX_MBIT_PER_S, Knots, Rate, held_rates
 from bufgym.traces.formats.recipes import field_of, unit_named
-from bufgym.traces.formats.text import NUMBER, Line, is_header, open_text, split_cells
+from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S
 from bufgym.traces.trace import US_PER_S
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.units import RATES
 
-CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
-MAX_MBIT_PER_S: Final = 10**6
 NAMED: Final = "--time COL --rate COL --unit kB/s (read_trace(columns=Columns(...)))"
 _RATE_NAMES: Final = {name.lower() for name in RATES}
 
-# 2286-11-20, the last epoch in ms with 13 digits.
-_MAX_EPOCH_MS: Final = 10**13
 _MAX_EPOCH_S: Final = 10**10
-
-
-def read_csv(path: StrPath) -> Knots:
-    """Header `t_ms,bytes,interval_ms`; times in ms with up to 3 decimals, so that microseconds survive."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.below_header(f"the header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER))[1]:
-            end_ms, count, length_ms = line.columns(3, ",")
-            intervals.add_ending_at(line, end_ms, length_ms, count)
-    return intervals.knots(path)
-
-
-def read_belgium(path: StrPath) -> Knots:
-    """Raw log of the Ghent 4G measurements; position and epoch are checked, but not used."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.lines():
-            epoch, end_ms, latitude, longitude, count, length_ms = line.columns(6)
-            line.whole("epoch in ms", epoch, _MAX_EPOCH_MS)
-            line.decimal("latitude", latitude, -90, 90)
-            line.decimal("longitude", longitude, -180, 180)
-            intervals.add_ending_at(line, end_ms, length_ms, count)
-    return intervals.knots(path)
-
-
-def read_mbit(path: StrPath) -> Knots:
-    """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
-    with open_text(path) as file:
-        cells = ((line, line.columns(2)) for line in file.lines())
-        return held_rates(path, (_rate(line, time, rate, "Mbit/s", 0.125) for line, (time, rate) in cells))
 
 
 @dataclass(frozen=True)
@@ -66,6 +32,11 @@ class Columns:
     """Of the rate: B/s, kB/s, Mbit/s, ..."""
     time_unit: str = ""
     """s, ms, us or ns; by default that in the time's name, else s."""
+
+
+def read_mbit(path: StrPath) -> Knots:
+    """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
+    return read_table(path, Columns("1", "2", "Mbit/s"))
 
 
 def fits_rates(text: str) -> bool:
@@ -104,7 +75,7 @@ def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterat
     for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
         # A column named time_s may hold anything.
         named = columns.time_unit or unit_named(names[0]).removesuffix("s" if names[0] == "time_s" else "?")
-        yield _rate(line, time, rate, names[1], unit, named)
+        yield _rate(line, time, rate, columns.unit, unit, named)
 
 
 def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
@@ -141,11 +112,11 @@ def cells_of(text: str, separator: str) -> list[str]:
 
 
 def place_of(line: Line, header: list[str], name: str) -> int:
-    """The place of a column that is named, or numbered from 1."""
-    if name in header:
-        return header.index(name)
+    """The place of a column that is numbered from 1, or named."""
     if name.isdecimal() and 1 <= int(name[:6]) <= len(header):
         return int(name) - 1
+    if name in header:
+        return header.index(name)
     raise line.error(None, f"has no column {name!r}: must be one of {', '.join(header)[:300]}, or a number from 1")
 
 

@@ -22,11 +22,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
-from bufgym.traces.plausible import check_slow_poses
+from bufgym.traces.plausible import check_slow_poses, warn_of_jumps
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.utils.errors import BufgymError, TraceError
@@ -81,7 +80,7 @@ def read_poses(
         rows, about = table
         normalize(rows.values[:, 3:])
         poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{about}{rows.note}", rows.start_us)
-        warn_of_leaps(path, poses)
+        warn_of_jumps(path, poses)
         return poses
     unit, named = _OWN_UNIT.get(format or "", "s"), format is not None
     if format is None:
@@ -101,7 +100,7 @@ def read_poses(
         poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}", rows.start_us)
     if unit == "s" and format == "tum" and not named:
         check_slow_poses(path, poses)
-    warn_of_leaps(path, poses)
+    warn_of_jumps(path, poses)
     return poses
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES
 from bufgym.traces.formats.mahimahi import PACKET_BYTES
-from bufgym.traces.formats.tables import CSV_HEADER
 from bufgym.traces.formats.text import decimals, write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
+CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 # Lines of at most 11 digits, as many as fit into the reader's 128 MiB.
 MAX_PACKETS: Final = 10**7
 
