@@ -16,7 +16,7 @@ from bufgym.traces.formats.recipes import Recipe, field_of, recipes, unit_named
 from bufgym.traces.formats.rows import RowReader, Rows, read_rows
 from bufgym.traces.formats.tables import cells_of, date_us, place_of, separator_of
 from bufgym.traces.formats.text import Line, open_text
-from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE, is_number, time_in_us
+from bufgym.traces.formats.trajectories import MOST, NO_TURN, is_number, pose_row
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.trace import US_PER_S
 from bufgym.utils.errors import BufgymError
@@ -26,8 +26,6 @@ _TURN: Final = ("qx", "qy", "qz", "qw")
 _OWN_COUNTS: Final = (8, 11, 12, 17)  # Columns of TUM, EuRoC and KITTI, whose header is a remark
 _TIMES_READ: Final = 1000
 _DAY_S: Final = 86_400
-_MOST: Final = {"latitude": 90.0, "longitude": 180.0, "altitude": 1e5}
-_NO_TURN: Final = [0.0, 0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,8 @@ def read_pose_table(
     table = _table(path, columns)
     if table is None:
         return None
-    rows = read_rows(path, _row(table), skip=table.header, what="poses", advance=advance)
+    row = pose_row(table.places, (table.columns,), table.unit, table.separator)
+    rows = read_rows(path, row, skip=table.header, what="poses", advance=advance)
     flat = "latitude" in table.places
     about = f"columns {', '.join(table.places)}, times in {table.unit}"
     return (_in_metres(rows) if flat else rows), about
@@ -82,11 +81,8 @@ def _table(path: StrPath, columns: PoseColumns | None) -> _Table | None:
             is_remark = line.text.startswith("#")
             if not count:
                 if is_remark or not any(is_number(cell) for cell in cells):
-                    names, header, in_remark = (
-                        cells_of(line.text.lstrip("#"), separator_of(line.text)),
-                        line.number,
-                        is_remark,
-                    )
+                    names = cells_of(line.text.lstrip("#"), separator_of(line.text))
+                    header, in_remark = line.number, is_remark
                     continue
                 count, separator = len(cells), separator_of(line.text)
                 if columns is None and (len(names) != count or (in_remark and count in _OWN_COUNTS)):
@@ -137,31 +133,6 @@ def _chosen(line: Line, names: list[str], columns: PoseColumns) -> dict[str, int
     return {field: place_of(line, names, name) for field, name in {"time": columns.time, **wanted}.items()}
 
 
-def _row(table: _Table) -> RowReader:
-    """The reader of a line of the table."""
-    fields = [field for field in table.places if field != "time"]
-    place, turn = fields[: 3 if len(fields) in (3, 7) else 2], fields[3:]
-
-    def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-        cells = cells_of(line.text, table.separator)
-        if len(cells) != table.columns:
-            raise line.error(line.text, f"must have {table.columns} columns, has {len(cells)}")
-        text = cells[table.places["time"]]
-        date = date_us(text)
-        values = []
-        for field in place:
-            most = _MOST.get(field, MAX_POSITION_M)
-            values.append(line.decimal(field, cells[table.places[field]], -most, most))
-        quaternion = [line.decimal(field, cells[table.places[field]], -2, 2) for field in turn] or _NO_TURN
-        norm = float(np.linalg.norm(quaternion))
-        if abs(norm - 1) > NORM_TOLERANCE:
-            raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
-        us = time_in_us(line, text, table.unit) if date is None else date
-        return text, us, [*values, *([0.0] * (3 - len(values))), *quaternion]
-
-    return row
-
-
 def _recipe_row(recipe: Recipe) -> RowReader:
     """The reader of a fix of a satellite receiver."""
     above_us = [0]
@@ -171,7 +142,7 @@ def _recipe_row(recipe: Recipe) -> RowReader:
         if groups is None:
             return None
         place = []
-        for field, most in _MOST.items():
+        for field, most in MOST.items():
             text, value = groups.get(f"{field}_dm"), float(groups.get(field) or 0)
             if text:  # degrees and two digits of minutes before the point
                 at = text.index(".") - 2
@@ -180,14 +151,14 @@ def _recipe_row(recipe: Recipe) -> RowReader:
         place[0] *= -1 if groups.get("ns") == "S" else 1
         place[1] *= -1 if groups.get("ew") == "W" else 1
         if (text := groups.get("date", "")) and (date := date_us(text)) is not None:
-            return text, date, [*place, *_NO_TURN]
+            return text, date, [*place, *NO_TURN]
         if not (text := groups.get("hms", "")):
             raise line.error(line.text, "must hold a time")
         us = round((int(text[:2]) * 3600 + int(text[2:4]) * 60 + float(text[4:])) * US_PER_S)
         while us < above_us[0] - _DAY_S * US_PER_S // 2:
             us += _DAY_S * US_PER_S  # after midnight
         above_us[0] = us
-        return text, us, [*place, *_NO_TURN]
+        return text, us, [*place, *NO_TURN]
 
     return row
 

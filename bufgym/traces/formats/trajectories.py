@@ -14,7 +14,7 @@ on the order of a quaternion's four.
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -23,6 +23,7 @@ import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
+from bufgym.traces.formats.tables import cells_of, date_us
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.plausible import check_slow_poses, warn_of_jumps
@@ -42,7 +43,12 @@ MAX_EPOCH_S: Final = 1e11
 _EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
 # State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
 _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
-_NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("px", "py", "pz", "qw", "qx", "qy", "qz")}
+MOST: Final = {"latitude": 90.0, "longitude": 180.0, "altitude": 1e5}
+NO_TURN: Final = [0.0, 0.0, 0.0, 1.0]
+_NAMES: Final = {
+    "tum": ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    "euroc": ("time", "px", "py", "pz", "qw", "qx", "qy", "qz"),
+}
 _OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
 _SURE_NORM: Final = NORM_TOLERANCE - 1e-9  # Whatever the rounding of the norm
@@ -92,9 +98,8 @@ def read_poses(
     elif times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
     else:
-        rows = read_rows(
-            path, _pose_row(format, unit), read_block=_pose_block(format, unit), what="poses", advance=advance
-        )
+        row = pose_row({name: k for k, name in enumerate(_NAMES[format])}, _COLUMNS[format], unit)
+        rows = read_rows(path, row, read_block=_pose_block(format, unit), what="poses", advance=advance)
         note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
         normalize(rows.values[:, 3:])
         poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}", rows.start_us)
@@ -117,8 +122,8 @@ def _detected(path: StrPath, counts: tuple[int, ...]) -> tuple[str, str]:
             if not columns:
                 columns, blanks = len(cells), "," not in line.text
                 if columns not in counts:
-                    raise _miscounted(line, columns, "8 columns (or 11 or 17 of a state estimate)")
-            if (columns == 12 and blanks) or len(times) == _TIMES_READ or not re.fullmatch(NUMBER, cells[0]):
+                    raise _miscounted(line, columns, _COLUMNS["euroc"])
+            if (columns == 12 and blanks) or len(times) == _TIMES_READ or not is_number(cells[0]):
                 break
             times.append(float(cells[0]))
             decimals = max(decimals, len(cells[0].partition(".")[2]))
@@ -140,26 +145,42 @@ def seconds(line: Line, text: str) -> int:
     return round(line.decimal("time in s", text, 0, MAX_EPOCH_S) * US_PER_S)
 
 
-def _pose_row(format: str, unit: str) -> RowReader:
-    """The reader of a line of TUM or EuRoC with times in this unit."""
-    columns, names = _COLUMNS[format], _NAMES[format]
-    more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
+def pose_row(places: dict[str, int], columns: Sequence[int], unit: str, separator: str | None = None) -> RowReader:
+    """The reader of a line of so many columns that has a time in this unit, x, y[, z][, a quaternion] in these places.
+
+    Without ``separator``, cells are separated by commas if the line has any, else by blanks, and times are numbers.
+    """
+    fields = [field for field in places if field != "time"]
+    turn = fields[3:]
+    place = fields[: 3 if turn or len(fields) == 3 else 2]
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-        cells = _cells(line)
+        cells = _cells(line) if separator is None else cells_of(line.text, separator)
         if len(cells) not in columns:
-            raise _miscounted(line, len(cells), f"8 columns{more}")
-        return cells[0], time_in_us(line, cells[0], unit), _pose(line, cells[1:8], names)
+            raise _miscounted(line, len(cells), columns)
+        text, values = cells[places["time"]], list[float]()
+        date = None if separator is None else date_us(text)
+        for field in place:
+            most = MOST.get(field, MAX_POSITION_M)
+            values.append(line.decimal(field, cells[places[field]], -most, most))
+        values += [0.0] * (3 - len(values))
+        quaternion = [line.decimal(field, cells[places[field]], -MAX_POSITION_M, MAX_POSITION_M) for field in turn]
+        norm = math.hypot(*quaternion) if turn else 1
+        if abs(norm - 1) > NORM_TOLERANCE:
+            raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
+        return text, time_in_us(line, text, unit) if date is None else date, [*values, *(quaternion or NO_TURN)]
 
     return row
 
 
-def _miscounted(line: Line, columns: int, right: str) -> TraceError:
-    return line.misfit(f"must have {right}, has {columns}: name them with --time COL --pose X Y Z QX QY QZ QW")
+def _miscounted(line: Line, has: int, columns: Sequence[int]) -> TraceError:
+    more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
+    rule = f"must have {columns[0]} columns{more}, has {has}: name them with --time COL --pose X Y Z QX QY QZ QW"
+    return line.misfit(rule)
 
 
 def _pose_block(format: str, unit: str) -> BlockReader:
-    """The reader of a block of such lines, as `_pose_row` reads each."""
+    """The reader of a block of such lines, as `pose_row` reads each."""
     time_type, most = ("f8", MAX_EPOCH_S) if unit == "s" else ("i8", MAX_EPOCH_S / UNIT_S[unit])
     ticks = round(1 / (UNIT_S[unit] * US_PER_S))  # in a microsecond; 0 where the unit is longer
 
@@ -206,17 +227,6 @@ def time_in_us(line: Line, text: str, unit: str) -> int:
 def _cells(line: Line) -> list[str]:
     """The cells of a line, which are separated by commas if it has any."""
     return split_cells(line.text) if "," in line.text else line.text.split()
-
-
-def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:
-    """Position and quaternion."""
-    values = [
-        line.decimal(name, text, -MAX_POSITION_M, MAX_POSITION_M) for name, text in zip(names, cells, strict=True)
-    ]
-    norm = math.hypot(*values[3:])
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
-    return values
 
 
 def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callable[[int], object]) -> Poses:
