@@ -59,9 +59,6 @@ def load(
     """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
 
     A shipped name takes precedence, then a file.
-
-    Raises:
-        TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
     """
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:

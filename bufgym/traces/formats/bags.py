@@ -66,11 +66,6 @@ def read_bag(
         advance: called with 1 for each message read, as a progress bar's update.
         clock: "log" takes the recorder's log times; "stamps" the clock of the header stamps of the topic with most of
             them, on which every message arrives in the order of log times.
-
-    Raises:
-        TraceError: missing, not a recording, cut off, damaged, more than 10**4 topics, unpacking to too much (see
-            `bag_files`), of log times that cannot be true (see `clocks`).
-        BufgymError: the extra ``ros`` is not installed; ``odom`` is no topic or carries no poses.
     """
     if clock not in ("log", "stamps"):
         raise BufgymError(f"clock = {clock!r}: must be one of log, stamps")

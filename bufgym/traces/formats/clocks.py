@@ -43,11 +43,7 @@ class LogTimes:
         """Topic -> its number, in order of their first messages."""
 
     def add(self, channel: BagTopic, logged_ns: int, data: bytes) -> None:
-        """Add a message.
-
-        Raises:
-            TraceError: its log time does not fit 63 bits.
-        """
+        """Add a message."""
         if not 0 <= logged_ns <= MAX_LOG_NS:
             place = f"message {len(self._time_ns) + 1} ({channel.topic})"
             raise fault(self.path, "must be from 0 to 2**63 - 1 ns", value=logged_ns, field=f"{place}, log time in ns")
@@ -68,11 +64,7 @@ class LogTimes:
         return np.array(self._topic, np.int64)
 
     def order(self) -> Int64Array:
-        """The messages in order of log time, int64[n].
-
-        Raises:
-            TraceError: a log time of 0 where no clock begins there, or too far from the others; a clock that went back.
-        """
+        """The messages in order of log time, int64[n]."""
         time_ns = self.time_ns
         self._check_range(time_ns)
         self._check_steps(time_ns)

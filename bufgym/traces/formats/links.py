@@ -92,10 +92,6 @@ def read_trace(
 
     Returns:
         The trace, named after the file; `source` states the file, the format, and anything notable about the reading.
-
-    Raises:
-        TraceError: the file is missing, empty, damaged, of no known format, of two, or breaks a rule of its format.
-        BufgymError: an unknown `format`, `after` or `column`.
     """
     if holes not in get_args(Holes):
         raise BufgymError(f"holes = {holes!r}: must be one of {', '.join(get_args(Holes))}")

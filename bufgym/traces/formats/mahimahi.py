@@ -26,12 +26,7 @@ MAX_BYTES: Final = 2**27
 
 
 def read_mahimahi(path: StrPath) -> Knots:
-    """Knots of the capacity.
-
-    Raises:
-        TraceError: a line that is not a whole number from 0 to 10**10, a time before that of the line above,
-            no line at all, none after ms 0 (such a trace would have no duration), or over MAX_BYTES.
-    """
+    """Knots of the capacity."""
     with open_text(path) as file:
         stamps_ms = _parsed_at_once(file.whole(MAX_BYTES))
     if stamps_ms is None:

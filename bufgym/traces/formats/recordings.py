@@ -48,10 +48,6 @@ def read_workload(
             pose and after the last: none); otherwise a gap is an error.
         clock: the clock of a recording's arrivals (see `bags.read_bag`).
         advance: called with 1 for each message of a recording read, as a progress bar's update.
-
-    Raises:
-        TraceError: a file that cannot be read, or breaks a rule of its format.
-        BufgymError: an unknown topic, no message, or gaps without `bridge_gaps`.
     """
     if not is_recording(path):
         if odom is not None and Path(path).exists():

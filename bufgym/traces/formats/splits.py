@@ -85,10 +85,7 @@ def refuse_recording(path: StrPath, rule: str) -> None:
 
 
 def splits(path: StrPath | Sequence[StrPath]) -> list[Split]:
-    """The files of a recording, or of several that are read as one, of one kind, in the order in which they are read.
-
-    Raises TraceError: no recording; a file that the metadata names is missing or of another kind.
-    """
+    """The files of a recording, or of several that are read as one, of one kind, in the order in which they are read."""
     if not isinstance(path, str | PathLike):
         files = [split for one in path for split in splits(one)]
         for split in files:
@@ -104,10 +101,7 @@ def splits(path: StrPath | Sequence[StrPath]) -> list[Split]:
 
 
 def split_messages(files: list[Split], types: dict[str, str]) -> Iterator[tuple[Path, Message]]:
-    """Every message of a recording's files, with the file that it is in; adds every topic to ``types``.
-
-    Raises TraceError: a file that is damaged, with how much of it is sound.
-    """
+    """Every message of a recording's files, with the file that it is in; adds every topic to ``types``."""
     with os_errors(files[0].path, "read"):
         unpacked = Unpacked(sum(split.path.stat().st_size for split in files))
     for split in files:

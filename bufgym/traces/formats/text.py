@@ -156,11 +156,7 @@ class TextFile:
             raise fault(self.path, f"cannot be read: {error.strerror or error}", line=line) from error
 
     def lines(self) -> Iterator[Line]:
-        """The lines that are not blank, numbered from 1, without surrounding white space.
-
-        Raises:
-            TraceError: also for a line over MAX_LINE_CHARACTERS or not UTF-8, and more than MAX_LINES with blank ones.
-        """
+        """The lines that are not blank, numbered from 1, without surrounding white space."""
         for number, raw in self._raw_lines():
             line = _parsed_line(self.path, number, raw)
             if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
@@ -169,10 +165,7 @@ class TextFile:
                 yield line
 
     def blocks(self) -> Iterator[tuple[int, bytes]]:
-        """All lines in blocks of some MB, each with the number of its first line; see `block_lines`.
-
-        Raises TraceError as `lines`, a block at a time.
-        """
+        """All lines in blocks of some MB, each with the number of its first line; see `block_lines`."""
         number, rest = 1, b""
         while data := self._take(_BLOCK_BYTES, number, whole_line=False):
             cut = data.rfind(b"\n") + 1

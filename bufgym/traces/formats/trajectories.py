@@ -71,12 +71,6 @@ def read_poses(
         times: KITTI's file of times; by default the file of the same name with ``_times`` beside it.
         columns: of any other table, which columns hold what; without `format` and `times`.
         advance: called with the number of lines just read, as a progress bar's update.
-
-    Raises:
-        TraceError: the file cannot be read, or a line breaks a rule: as many finite numbers as the format has,
-            positions within 10**7 m, a quaternion of unit norm (a rotation matrix) within 1 %, times that never
-            decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more.
-        BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
     from bufgym.traces.formats.pose_tables import read_pose_table
 

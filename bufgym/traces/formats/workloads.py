@@ -30,10 +30,6 @@ def read_workload_csv(path: StrPath) -> Workload:
     """Read `time_s,bytes[,topic][,x]`, plain or packed; the first time and the first x become 0.
 
     A header of another tool may name a time, bytes and a topic among other columns, as `frame.time_epoch,frame.len`.
-
-    Raises:
-        TraceError: the file cannot be read, or a line breaks a rule: another header, times or x that decrease, sizes
-            that are not whole numbers from 1 to 10**10, an empty topic.
     """
     with open_text(path) as file:
         header, lines = file.below_header("the header time_s,bytes[,topic][,x], or name a time and bytes", _fields)
