@@ -41,7 +41,7 @@ _Event = tuple[int, int, int, bytes]
 
 def write_playback(
     path: Path,
-    recording: str,
+    recording: str | Sequence[str],
     policies: Sequence[Policy],
     scenario: Uplink,
     capacity: int,
@@ -53,7 +53,7 @@ def write_playback(
 
     Args:
         path: the file to write.
-        recording: the recording that the scenario plays; its messages are copied.
+        recording: the recording that the scenario plays, of one file or several; its messages are copied.
         policies: those that play, on the first of the scenario's traces.
         scenario: it plays the recording (``workload``).
         capacity: L.
@@ -62,7 +62,8 @@ def write_playback(
         settings: further arguments of the task, as of ``drops``.
     """
     workload = scenario.workload
-    if workload is None or not is_recording(recording):
+    files = [recording] if isinstance(recording, str) else recording
+    if workload is None or not all(map(is_recording, files)):
         raise BufgymError(f"{recording}: must be a recording that holds the messages themselves (MCAP, ROS bag)")
     _, part = by_trace(scenario)[0]
     episode, task = draw(part, seed), QueueTask(**settings)
@@ -71,12 +72,12 @@ def write_playback(
         senders = task.meet(policy, [episode], capacity, part)
         logs[policy.name] = np.asarray(senders.batch.log[0])[: len(episode.arrivals)]
     with needs("mcap", "ros", "--mcap"), replaced(path) as target, target.open("wb") as file:
-        return _write(file, recording, workload.topics, np.asarray(episode.arrivals), logs, scenario, advance)
+        return _write(file, files, workload.topics, np.asarray(episode.arrivals), logs, scenario, advance)
 
 
 def _write(
     file: Any,
-    recording: str,
+    recording: str | Sequence[str],
     topics: Sequence[str],
     arrivals: npt.NDArray[Any],
     logs: dict[str, npt.NDArray[Any]],

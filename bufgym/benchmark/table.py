@@ -67,7 +67,7 @@ COLUMNS = (
     Column("policy", "policy", str),
     Column("L", "capacity", str),
     Column("QoI", "qoi", score),
-    Column("regret", "regret", lambda share: decimal(100 * share, 2, "%")),
+    Column("regret", "regret", percent),
     Column("delivered", "delivered", partial(decimal, digits=1)),
     Column("dropped", "dropped", partial(decimal, digits=1)),
     Column("longest gap (x)", "longest_gap", score),

@@ -103,7 +103,7 @@ def bench(
             raise BufgymError("--drops needs --workload")
         if mcap is not None and (workload.workload is None or mcap.suffix != ".mcap"):
             raise BufgymError(f"--mcap {mcap}: must be FILE.mcap, and needs --workload")
-        if mcap is not None and not is_recording(str(workload.workload)):
+        if mcap is not None and not all(map(is_recording, workload.workload or [])):
             raise BufgymError(f"--mcap {mcap}: needs a recording that holds the messages themselves (MCAP, ROS bag)")
         experiment = _on_scenario(options, buffer, who.seeds)
     entrants, rival = who.entrants(experiment.task), who.rival()
@@ -129,7 +129,7 @@ def bench(
     if experiment.recorded:
         _print_drops(done, entrants, experiment, capacity, drops)
     if mcap is not None:
-        _write_playback(mcap, str(workload.workload), entrants, experiment, capacity[0])
+        _write_playback(mcap, workload.workload or [], entrants, experiment, capacity[0])
     if topic_policy is not None:
         by_topic = topics.by_topic(done.rows, topic_policy)
         print(f"\n{topic_policy}, topic by topic: means over episodes\n{by_topic}")
@@ -231,7 +231,7 @@ def _print_drops(
 
 
 def _write_playback(
-    file: Path, recording: str, players: Sequence[Policy], experiment: Experiment, capacity: int
+    file: Path, recording: Sequence[str], players: Sequence[Policy], experiment: Experiment, capacity: int
 ) -> None:
     """Write an episode of a recording as the policies would have sent it."""
     from bufgym.benchmark.playback import write_playback

@@ -71,8 +71,9 @@ class StreamOptions(LinkOptions):
 @Parameter(name="*", group=Group.create_ordered("A recording of a robot in place of the stream"))
 @dataclass(frozen=True)
 class WorkloadOptions(RecordingOptions):
-    workload: str | None = None
-    """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; alone, played once from the start of each trace."""
+    workload: list[str] | None = None
+    """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; several are one drive; alone, played once from the start of each
+    trace."""
 
 
 @Parameter(name="*", group=Group.create_ordered("One interruption of unknown length T instead"))
@@ -236,7 +237,7 @@ def _uplink(stream: StreamOptions, measured: MotionOptions) -> Described:
     return Described(scenario, facts=facts)
 
 
-def recorded(file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
+def recorded(files: Sequence[str], stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
     """Make a workload as recorded; with --seeds it starts at random places of each trace."""
     from bufgym import scenario as scenarios
     from bufgym.model import qoi
@@ -244,7 +245,7 @@ def recorded(file: str, stream: StreamOptions, recording: RecordingOptions, seed
 
     refuse(given(stream, *_MESSAGES), "cannot go with --workload: a recording has its own")
     with bar(None, True, "message") as advance:
-        workload = read_workload(file, **recording.arguments(), advance=advance)
+        workload = read_workload(files, **recording.arguments(), advance=advance)
     motions = _motions(stream.motion or [], recording)
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Final
 
@@ -28,7 +29,7 @@ _FEW: Final = 0.1  # Of all messages
 
 
 def read_workload(
-    path: StrPath,
+    path: StrPath | Sequence[StrPath],
     *,
     topics: Sequence[str] | None = None,
     odom: str | None = None,
@@ -40,7 +41,7 @@ def read_workload(
     """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
 
     Args:
-        path: the file or folder.
+        path: the file or folder; several recordings are read as one.
         topics: names, or patterns such as ``/camera/*``; by default all. They share one queue.
         odom: the topic whose motion gives x (recordings only; see `bags.read_bag`).
         settings: how motion is measured, by default `MotionSettings()`.
@@ -49,7 +50,9 @@ def read_workload(
         clock: the clock of a recording's arrivals (see `bags.read_bag`).
         advance: called with 1 for each message of a recording read, as a progress bar's update.
     """
-    if not is_recording(path):
+    if not isinstance(path, str | PathLike) and len(path) == 1:
+        path = path[0]
+    if isinstance(path, str | PathLike) and not is_recording(path):
         if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
         return _with_topics(read_workload_csv(path), topics)

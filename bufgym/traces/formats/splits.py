@@ -85,7 +85,7 @@ def refuse_recording(path: StrPath, rule: str) -> None:
 
 
 def splits(path: StrPath | Sequence[StrPath]) -> list[Split]:
-    """The files of a recording, or of several that are read as one, of one kind, in the order in which they are read."""
+    """The files of a recording, or of several of one kind that are read as one, in the order of reading."""
     if not isinstance(path, str | PathLike):
         files = [split for one in path for split in splits(one)]
         for split in files:
