@@ -13,7 +13,7 @@ from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.traces import PoseColumns, Trace, read_motion, read_trace, read_workload
+from bufgym.traces import Trace, read_motion, read_trace, read_workload
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.utils.errors import TraceError, TraceWarning
 
@@ -158,78 +158,6 @@ def test_a_car_whose_poses_come_in_bursts_does_not_jump(tmp_path: Path) -> None:
             warnings.simplefilter("always")
             assert read_poses(path).position_m[-1, 0] / 2 == total
         assert len(caught) == (step_m == 3)
-
-
-@pytest.mark.parametrize(
-    ("name", "right"),
-    [("openvins20.txt", (0.96667, 0.29)), ("rtabmap9.txt", (0.96667, 0.29)), ("head_names.csv", (9.967, 2.99))],
-)
-def test_tables_of_other_tools(name: str, right: tuple[float, float]) -> None:
-    """30 or 300 poses at 30 Hz, 0.02 m apart, in fields of 2 m; with more columns, or under names."""
-    motion = read_motion(ODD_FILES / "turn7" / name)
-    assert (motion.duration_us / 1e6, motion.total) == pytest.approx(right, abs=1e-6)
-
-
-# 3 poses 1 s apart, at 0, 3 and 9 m.
-TABLES = {
-    "%time,field.header.seq,field.pose.pose.position.x,field.pose.pose.position.y\n"
-    "1700000000000000000,1,0,0\n1700000001000000000,2,3,0\n1700000002000000000,3,9,0\n": None,
-    "stamp [ms];id;px;py;pz\n0;a;0,0;0;0\n1000;b;3,0;0;0\n2000;c;9,0;0;0\n": None,
-    "Date,X,Y,Z,QX,QY,QZ,QW\n"
-    + "".join(f"2024-01-31T12:00:0{k},{x},0,0,0,0,0,1\n" for k, x in ((0, 0), (1, 3), (2, 9))): None,
-    "a b c\n0 0 5\n0 1000 8\n0 2000 14\n": PoseColumns("b", ("c", "a"), "ms"),
-    "0 0 5\n0 1 8\n0 2 14\n": PoseColumns("2", ("3", "1", "1")),
-    "# id time x y z qx qy qz qw\n7 0 0 0 0 0 0 0 1\n7 1 3 0 0 0 0 0 1\n7 2 9 0 0 0 0 0 1\n": None,
-}
-
-
-@pytest.mark.parametrize("text", TABLES)
-def test_poses_of_any_table(tmp_path: Path, text: str) -> None:
-    poses = read_poses(written(tmp_path, text, "poses.txt"), columns=TABLES[text])
-    assert poses.time_us.tolist() == [0, 1_000_000, 2_000_000]
-    assert (poses.position_m - poses.position_m[0])[:, 0].tolist() == [0, 3, 9]
-
-
-def test_what_a_table_of_poses_lacks_is_said(tmp_path: Path) -> None:
-    path = written(tmp_path, "t,x,y\n0,1,2\n1,1,2,3\n", "poses.csv")
-    refuse("line 3: .*must have 3 columns, has 4", read_motion, path)
-    refuse("has no column 'w': must be one of t, x, y", read_motion, path, columns=PoseColumns("t", ("x", "w")))
-    refuse("must be x y, x y z, or", read_motion, path, columns=PoseColumns("t", ("x",)))
-    refuse("time_unit = 'h'", read_motion, path, columns=PoseColumns("t", ("x", "y"), "h"))
-    refuse("go without format and times", read_motion, path, columns=PoseColumns("t", ("x", "y")), format="tum")
-    nine = written(tmp_path, "0 0 0 0 0 0 0 1 5\n1 0 0 0 0 0 0 1 5\n", "nine.txt")
-    refuse("must have 8 columns.*has 9: name them with --time COL --pose", read_motion, nine)
-    norm = written(tmp_path, "t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,2\n1,0,0,0,0,0,0,1\n", "norm.csv")
-    refuse("line 2: norm of the quaternion = 2: must be 1 within 1 %", read_motion, norm)
-    refuse("is XML, as of GPX", read_motion, written(tmp_path, "<?xml version='1.0'?>\n<gpx/>\n", "a.gpx"))
-
-
-def test_messages_of_other_tools(tmp_path: Path) -> None:
-    """Times in s, in ms by the header, and as dates; a topic, and columns of no use."""
-    for text in (
-        "frame.number,frame.time_epoch,frame.len\n1,1700000000.25,10\n2,1700000001.75,20\n",
-        "stamp_ms,size,note\n250,10,a\n1750,20,b\n",
-        "channel,date,bytes\na,2024-01-31T12:00:00.25,10\na,2024-01-31T12:00:01.75,20\n",
-    ):
-        workload = read_workload(written(tmp_path, text))
-        assert (workload.arrival_us.tolist(), workload.size_bytes.tolist()) == ([0, 1_500_000], [10, 20])
-
-
-def test_receivers_of_satellites(tmp_path: Path) -> None:
-    """A thousandth of a degree of latitude at 45 degrees is 111.13 m, over midnight in 2 s; also as JSON and as CSV."""
-    fix = "$GPGGA,{0}.00,45{1},N,00700.0000,W,1,08,0.9,100.0,M,46.9,M,,*47\n"
-    nmea = "$GPRMC,1*00\n" + fix.format("235959", "00.0000") + fix.format("000001", "00.0600")
-    gpsd = '{"class":"VERSION"}\n' + "".join(
-        f'{{"class":"TPV","mode":3,"time":"2024-01-31T12:00:0{2 * k}.000Z","lat":{45 + k / 1000},"lon":-7,"alt":100}}\n'
-        for k in range(2)
-    )
-    csv = "time,lat,lon,elevation,accuracy\n2024-01-31T12:00:00Z,45,-7,100,3\n2024-01-31T12:00:02Z,45.001,-7,100,3\n"
-    for text in (nmea, gpsd, csv):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", TraceWarning)  # 200 km/h
-            poses = read_poses(written(tmp_path, text, "gps.txt"))
-        assert poses.time_us.tolist() == [0, 2_000_000] and "no orientation" in poses.format
-        assert poses.position_m[1] == pytest.approx([0, 111.13, 0], abs=0.02)
 
 
 def test_poses_in_bursts_are_as_valid_as_others(tmp_path: Path) -> None:

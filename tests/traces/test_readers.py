@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from cli_cases import Capsys, fails, shown
 from link_files import HEADER, SAMPLES, UCC_HEADER, knots, written
-from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
 from bufgym.cli import main
-from bufgym.traces import FORMATS, Columns, detect_format, read_trace
+from bufgym.traces import FORMATS, detect_format, read_trace
 from bufgym.traces.formats import links, mahimahi
 from bufgym.traces.formats import text as text_files
 from bufgym.utils.errors import BufgymError, TraceError
@@ -114,61 +113,6 @@ def test_mahimahi_line_by_line_is_the_same(tmp_path: Path, monkeypatch: pytest.M
     assert np.interp(ends_ms * 1000, whole.time_us, whole.cumulative_bytes).tolist() == expected.tolist()
     monkeypatch.setattr(mahimahi, "_parsed_at_once", lambda text: None)
     assert read_trace(path) == whole
-
-
-def test_columns_of_any_table(tmp_path: Path) -> None:
-    """1 kB/s for 2 s and 3 kB/s for 2 s more, with blanks, commas, semicolons or tabs, by name and by number."""
-    right = [(0, 0), (2 * S, 2_000), (4 * S, 8_000)]
-    for text, columns in (
-        ("i,when [ms],cell,up\n0,500,a,1\n1,2500,b,3\n", Columns("when [ms]", "up", "kB/s")),
-        ('"i";"when";"up"\n0;0,5;8,0\n1;2,5;24\n', Columns("when", "up", "kbit/s")),
-        ("up\tat_us\n1000\t0\n3000\t2000000\n", Columns("at_us", "1", "B/s")),
-        ("7 500 1\n7 2500 3\n", Columns("2", "3", "kB/s", "ms")),
-        ("# time up\n0 1\n2 3\n", Columns("time", "up", "kB/s")),
-        ("up,time\n1,2024-01-31 12:00:00\n3,2024-01-31 12:00:02\n", Columns("2", "1", "kB/s")),
-    ):
-        assert knots(read_trace(written(tmp_path, text), columns=columns)) == right, text
-    path = written(tmp_path, "a,b\n0,1\n1,1,1\n")
-    refuse(
-        "line 1: .*has no column 'c': must be one of a, b, or a number from 1",
-        read_trace,
-        path,
-        columns=Columns("c", "b"),
-    )
-    refuse("line 3: 0*1,1,1: must have 2 columns, has 3", read_trace, path, columns=Columns("a", "b"))
-    refuse(
-        "unit of the rate = furlongs: b is a bit and B a byte: must be as Mbps or MBps",
-        read_trace,
-        path,
-        columns=Columns("a", "b", "furlongs"),
-    )
-    refuse("time_unit = 'h': must be one of s, ms, us, ns", read_trace, path, columns=Columns("a", "b", time_unit="h"))
-    refuse("go without format and column", read_trace, path, "mbit", columns=Columns("a", "b"))
-    refuse(r"line 1: a,b: must fit a known format .*, or name its columns: --time COL --rate COL", read_trace, path)
-
-
-def test_what_other_tools_write(tmp_path: Path) -> None:
-    """One interface, one stream or their sums, a counter that grows; and ping is no measurement of capacity."""
-    files = ODD_FILES / "turn7"
-    assert knots(read_trace(files / "pandas_index.csv")) == [(k * S, k * 1_250_000) for k in range(6)]
-    assert knots(read_trace(files / "iperf2.txt")) == [(0, 0), (S, 1_310_720)]
-    assert knots(read_trace(files / "mm_log.log")) == [(0, 0), (1000, 1500)]
-    received = read_trace(written(tmp_path, SAMPLES["proc-net-dev"]), column="download")
-    assert knots(received) == [(0, 0), (S, 200), (3 * S, 400)]
-    lines = "[{0}]  0.00-1.00   sec  {1} KBytes  8 Kbits/sec    0   9 KBytes\n"
-    streams = "Connecting to host a, port 5201\n" + lines.format("  5", 1) + lines.format("  7", 3)
-    assert read_trace(written(tmp_path, streams + lines.format("SUM", 4))).total_bytes == 4096
-    for text, says in (
-        (streams, "holds streams 5, 7 and no sum of them"),
-        (SAMPLES["proc-net-dev"].replace("wlan0: 700", "eth0: 700"), "must be of one interface, not of eth0 and wlan0"),
-        (
-            SAMPLES["proc-net-dev"].replace("3000", "30"),
-            r"line 7: upload = 30: must not be below the line above \(1000\)",
-        ),
-        (SAMPLES["mm-link"] + "?", "line 7: .*must be a line of mm-link"),
-        ("PING 1.1.1.1 (1.1.1.1) 56(84) bytes of data.\n", "is the output of ping, which says how long"),
-    ):
-        refuse(says, read_trace, written(tmp_path, text), kind=TraceError)
 
 
 def test_ucc_columns(tmp_path: Path) -> None:
