@@ -129,7 +129,7 @@ def _ours_may_end(records: Iterator[Any], file: _Bounded) -> Iterator[Any]:
             file.ends_early = file.ends_early or getattr(record, "library", "") == "bufgym"
             yield record
     except EOFError:
-        return
+        file.left = 0  # a part of a record
 
 
 def _records(chunk: bytes) -> Iterator[tuple[int, memoryview]]:

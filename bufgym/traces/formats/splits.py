@@ -156,7 +156,7 @@ def damage_errors(path: Path, before: str = "", after: Callable[[], str] = str) 
     """Turn whatever the libraries raise on a damaged file into one error that names the file."""
     try:
         yield
-    except BufgymError:
+    except (BufgymError, Warning):
         raise
     except ModuleNotFoundError as error:
         raise missing(f"{path}: reading recordings", error.name, "ros") from None
