@@ -46,6 +46,12 @@ def test_columns_of_any_table(tmp_path: Path) -> None:
     refuse(r"line 1: a,b: must fit a known format .*, or name its columns: --time COL --rate COL", read_trace, path)
 
 
+def test_numbers_name_columns_where_a_cell_is_the_same_number(tmp_path: Path) -> None:
+    """Time in the second column, whose first cell is 1: no header."""
+    path = written(tmp_path, "5 1\n7 2\n")
+    assert knots(read_trace(path, columns=Columns("2", "1", "B/s"))) == [(0, 0), (S, 5), (2 * S, 12)]
+
+
 def test_what_other_tools_write(tmp_path: Path) -> None:
     """One interface, one stream or their sums, a counter that grows; and ping is no measurement of capacity."""
     files = ODD_FILES / "turn7"
@@ -123,6 +129,12 @@ def test_messages_of_other_tools(tmp_path: Path) -> None:
     ):
         workload = read_workload(written(tmp_path, text))
         assert (workload.arrival_us.tolist(), workload.size_bytes.tolist()) == ([0, 1_500_000], [10, 20])
+
+
+def test_x_stands_beside_times_in_any_unit(tmp_path: Path) -> None:
+    workload = read_workload(written(tmp_path, "time_ms,bytes,topic,x\n0,5,a,1\n500,5,b,2.5\n"))
+    assert workload.x is not None
+    assert (workload.arrival_us.tolist(), workload.x.tolist()) == ([0, 500_000], [0, 1.5])
 
 
 def test_receivers_of_satellites(tmp_path: Path) -> None:

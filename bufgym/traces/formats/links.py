@@ -19,10 +19,9 @@ from bufgym.traces.formats import tables
 from bufgym.traces.formats.faults import StrPath, fault, heard
 from bufgym.traces.formats.intervals import Knots
 from bufgym.traces.formats.iperf3 import DIRECTIONS, read_iperf3
-from bufgym.traces.formats.logs import UCC_COLUMNS, fits_ucc, read_sabre, read_ucc
+from bufgym.traces.formats.logs import RULER, RUN, RUNS, UCC_COLUMNS, fits_ucc, read_runs, read_sabre, read_ucc
 from bufgym.traces.formats.mahimahi import read_mahimahi
 from bufgym.traces.formats.recipes import Recipe, read_link, recipes
-from bufgym.traces.formats.speed_tests import RULER, RUN, RUNS, read_runs
 from bufgym.traces.formats.splits import refuse_recording
 from bufgym.traces.formats.text import NUMBER, open_text
 from bufgym.traces.sheet import Sheet, time_facts

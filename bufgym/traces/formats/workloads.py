@@ -68,9 +68,9 @@ def read_workload_csv(path: StrPath) -> Workload:
 def _fields(header: str) -> list[str]:
     """What each column of a header holds, by names that other tools use too; empty without a time and bytes."""
     names = split_cells(header)
-    if ",".join(names) in WORKLOAD_HEADERS:
-        return names
     fields = [{"time": "time_s"}.get(field_of(name), field_of(name)) for name in names]
+    if ",".join((fields[0], *names[1:])) in WORKLOAD_HEADERS:
+        return [fields[0], *names[1:]]
     fields = [field if field in ("time_s", "bytes", "topic") else str(k) for k, field in enumerate(fields)]
     return fields if [fields.count(field) for field in ("time_s", "bytes")] == [1, 1] else []
 
