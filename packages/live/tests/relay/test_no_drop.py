@@ -25,6 +25,7 @@ from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.store import Store
+from bufgym_live.relay.stored import UNKNOWN
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import free_port
 
@@ -102,7 +103,7 @@ async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
             said = [await operator.next()]
             if seq > 4:
                 said.append(await operator.next())
-                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1} in said
+                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1, "why": UNKNOWN} in said
             assert {"op": "ack", "seq": seq} in said
             await robot.came(seq)
             await robot.say("ack", seq=seq)
@@ -204,7 +205,7 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
                     await operator.acked(COMMAND, 1)
             async with client(server.port, session="a") as old, client(server.port, session="b") as other:
                 assert (await operator.next(), other.welcome["op"]) == (
-                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1},
+                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1, "why": UNKNOWN},
                     "welcome",
                 )
                 async with client(server.port, session="a") as new, client(server.port, session="c") as more:
