@@ -18,6 +18,7 @@ from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.facts import Facts
+from bufgym_live.relay.orders import robot_of
 from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.stored import UNKNOWN, Settled, StoredSession
@@ -308,11 +309,12 @@ class Held:
             for statement in also:
                 self._db.execute(statement, (session.id,))
             for id, number in rows:
-                (sender, seq, receivers, waiting, gone, size_bytes, why) = self._db.execute(
+                (sender, seq, receivers, waiting, gone, size_bytes, why, topic) = self._db.execute(
                     "UPDATE message SET waiting = waiting - 1, lost = lost + ?, why = coalesce(nullif(?, ''), why) "
-                    "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why",
-                    (lost, session.answers.get(number, UNKNOWN if lost else ""), id),
+                    "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why, topic",
+                    (lost, session.answers.get(number, ""), id),
                 ).fetchone()
+                why = why or (UNKNOWN if gone and robot_of(topic) else "")
                 sizes.append(size_bytes)
                 if waiting == 0:
                     self._db.execute("DELETE FROM message WHERE id = ?", (id,))

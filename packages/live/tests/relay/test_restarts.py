@@ -36,6 +36,7 @@ RULE = Rule(address="127.0.0.0/8", send=True, receive=True, command_s=DEADLINE_S
 OTHERS = Rule(nats=True, send=True, receive=True, topic="/robots/.*", command_s=DEADLINE_S)
 ROUNDS = [4, pytest.param(200, marks=pytest.mark.nightly)]
 FEW_ROUNDS = [2, pytest.param(200, marks=pytest.mark.nightly)]
+long = pytest.mark.timeout(1200)
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +94,7 @@ async def play(one: Field, rounds: int, seed: int) -> Counter[str]:
     return one.truth.counts
 
 
+@long
 @pytest.mark.parametrize("rounds", ROUNDS)
 async def test_a_relay_that_restarts(rounds: int, tmp_path: Path, seed: int = 1) -> None:
     port = free_port("127.0.0.1")
@@ -117,6 +119,7 @@ class Killed:
 
 
 @pytest.mark.nightly
+@long
 @pytest.mark.parametrize("rounds", [200])
 async def test_a_relay_that_is_killed(rounds: int, tmp_path: Path, seed: int = 2) -> None:
     port = free_port("127.0.0.1")
@@ -131,6 +134,7 @@ async def test_a_relay_that_is_killed(rounds: int, tmp_path: Path, seed: int = 2
 
 
 @needs_server
+@long
 @pytest.mark.parametrize("rounds", FEW_ROUNDS)
 async def test_two_relays_over_nats(rounds: int, tmp_path: Path, seed: int = 3) -> None:
     """The robot is at one, the operators at the other. NATS is killed, too."""
