@@ -124,7 +124,7 @@ async def test_the_identity_with_most_bytes_makes_room() -> None:
         await store.hold(sender, seq, "/a", bytes(size), [receiver])
     assert lost == []
     await store.hold(sender, 4, "/a", bytes(2), [robot])
-    assert lost == [Settled(sender, 3, 1, 1, UNKNOWN)]
+    assert lost == [Settled(sender, 3, 1, 1)]
     assert [one.held_bytes for one in (robot, *hogs)] == [5, 3, 0] and store.held_bytes == 8
     for size, receivers in ((3, [robot]), (11, [robot, hogs[0]])):  # now the robot has the most
         with pytest.raises(BufgymError, match=f"no room for {size} bytes beside 8"):
