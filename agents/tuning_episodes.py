@@ -85,7 +85,7 @@ class Task:
             return Task(place.on, suite.kind, splits, place.capacity or suite.capacities, rule)
         if place.workload is not None:
             stream = StreamOptions(trace=list(place.trace) or None)
-            found = recorded(place.workload, stream, WorkloadOptions(workload=place.workload), None).scenario
+            found = recorded([place.workload], stream, WorkloadOptions(workload=[place.workload]), None).scenario
             is_once = len(found.traces) == 1
         else:
             changes = {"traces": place.trace} if place.trace else {}

@@ -32,6 +32,7 @@ from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.client import RobotClient
 from bufgym_live.relay.session import Session
+from bufgym_live.relay.stored import UNKNOWN
 from bufgym_live.robot.sockets import free_port
 
 RELAYS, RATE_HZ, SIZE_BYTES, COMMAND_S, DEADLINE_S = 3, 2.0, 20_000, 0.5, 60
@@ -114,8 +115,9 @@ class Soak:
                 try:
                     await operator.command(f"/robots/{to}/command", [k, number])
                     self.acked[(to, k, number)] = time.monotonic()
-                except BufgymError:
-                    self.refused.add((to, k, number))
+                except BufgymError as error:
+                    if UNKNOWN not in str(error):  # then it may have been executed
+                        self.refused.add((to, k, number))
 
     async def kill(self, until_s: float) -> None:
         for k in itertools.cycle(range(1, RELAYS)):

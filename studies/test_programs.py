@@ -34,6 +34,7 @@ ELSEWHERE = {
     "studies.fit_sizes": "studies/test_fit_sizes.py",
     "studies.learned": "tests/test_families.py",
     "studies.peers": "needs the other packages",
+    "studies.plausible": "tests/traces/test_plausible.py",
     "studies.perf": "studies/test_perf.py",
     "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
     "studies.sb3_defaults": "studies/test_sb3_defaults.py",

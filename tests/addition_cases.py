@@ -53,16 +53,13 @@ def _halves(split: str, data: str | None = None) -> dict[str, Setting]:
 
 SUITES += (Suite("halves-v1", "slow links", _halves, capacities=(2,), seeds=1),)
 """
-FORMAT = '''
+RECIPE = """
 
-def read_kilobytes(path: StrPath) -> Knots:
-    """Knots of a file with a line for each second."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.lines():
-            intervals.add(1_000_000, 1000 * line.whole("kB", line.columns(2)[1], 10**9))
-    return intervals.knots(path)
-'''
+[links.kilobytes]
+about = "number kB/s, a line a second"
+first = '[0-9]+ kB/s'
+line = '(?P<bytes>[0-9]+) (?P<unit>kB/s)'
+"""
 FIGURE = '''
 from dataclasses import dataclass
 from typing import Any
@@ -206,15 +203,11 @@ ROWS = {
     "a trace format": Addition(
         {},
         {
-            "bufgym/traces/formats/tables.py": ("", FORMAT),
-            "bufgym/traces/formats/links.py": (
-                '    "iperf3":',
-                '    "kilobytes": Format("kB, a number", _cells("kB", NUMBER), tables.read_kilobytes),\n    "iperf3":',
-            ),
-            "tests/traces/link_files.py": ("SAMPLES = {\n", 'SAMPLES = {\n    "kilobytes": "kB 5\\nkB 7\\n",\n'),
-            "docs/guide/recordings.md": ("\n| `runs` |", "\n| `kilobytes` | `kB 5` a second | a test |\n| `runs` |"),
+            "bufgym/traces/formats/recipes.toml": ("", RECIPE),
+            "tests/traces/link_files.py": ("SAMPLES = {\n", 'SAMPLES = {\n    "kilobytes": "5 kB/s\\n7 kB/s\\n",\n'),
+            "docs/guide/recordings.md": ("\n| `runs` |", "\n| `kilobytes` | `5 kB/s` a second | a test |\n| `runs` |"),
         },
-        "open('mine.txt', 'w').write('kB 5\\nkB 7\\n')\n"
+        "open('mine.txt', 'w').write('5 kB/s\\n7 kB/s\\n')\n"
         "assert bufgym.traces.read_trace('mine.txt').cumulative_bytes.tolist() == [0, 5000, 12000]",
     ),
     "a figure of a paper": Addition(

@@ -5,7 +5,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from bufgym.benchmark.sweep import Sweep
 from bufgym.policies import Policy, registry
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
+from bufgym.scenario.texts import doubts
 from bufgym.utils.errors import BufgymError, unknown
 from bufgym.utils.files import write_text
 from bufgym.utils.libraries import library
@@ -156,7 +157,8 @@ def compare(
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
-    words: dict[str, Any] = {"label": label, "about": about or label or scenarios.about(scenario)}
+    about = "\n".join([about or label or scenarios.about(scenario), *doubts(scenario)])
+    words: dict[str, Any] = {"label": label, "about": about}
     play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
     if out is None:
         return play(**words, **of_a_queue)
@@ -199,7 +201,20 @@ def _compare_on_scenario(
     invited = _with_rival(entrants, rival, task)
     players = _with_missing(invited, [make_policy(task.baseline)])
     seeds = task.seeds if seeds is None else seeds
-    played = run(players, scenario, capacities or (task.capacity,), seeds, label=label, progress=progress, **of_a_queue)
+    how = {"label": label, "progress": progress, **of_a_queue}
+    played = run(players, scenario, capacities or (task.capacity,), seeds, **how)
+    holes = [hole for trace in getattr(scenario, "traces", ()) for hole in trace.holes]
+    if holes and task.kind == "queue":
+        zero = not any(trace.rate_bytes_per_s([start for start, _ in trace.holes]).any() for trace in scenario.traces)
+        used, other = ("zero", "hold") if zero else ("hold", "zero")
+        filled = replace(scenario, traces=tuple(trace.with_holes(other) for trace in scenario.traces))
+        again = run(players, filled, capacities or (task.capacity,), seeds, **how)
+        others = {(entry["policy"], entry["capacity"]): entry["qoi"] for entry in table.means(again)}
+        both = ", ".join(
+            f"{entry['policy']} {entry['qoi']:.3f} or {others[entry['policy'], entry['capacity']]:.3f}"
+            for entry in table.means(played)
+        )
+        about += f"\nQoI with --holes {used} (as below) or {other}: {both}"
 
     unranked = table.unranked_among(players)
     summary = task.summary(played, unranked, "" if rival is None else rival.name)

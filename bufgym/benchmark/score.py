@@ -41,6 +41,7 @@ REFERENCE = "afr"  # Policy that improvements and differences compare with; with
 
 DISCRIMINATIVE = 0.01  # A cell is discriminative, and counts, where the baseline's regret is at least this
 
+SHARES = 0.0, 1.0  # Bounds of probabilities and regrets
 NEGLIGIBLE = 1e-9  # Mean regret up to which a ratio to it says nothing
 
 
@@ -131,9 +132,9 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
                 by_cell[cell] = s._replace(**none)
         for cell, s in by_cell.items():
             episodes_of = {cell[0]: table.episodes[cell[0]]}
-            qoi, score, regrets, more = (
-                interval(numbers, links_in(episodes_of)) for numbers in (s.qoi, s.score, s.regret, s.difference)
-            )
+            drawn_links = links_in(episodes_of)
+            qoi, score, more = (interval(numbers, drawn_links) for numbers in (s.qoi, s.score, s.difference))
+            regrets = interval(s.regret, drawn_links, within=SHARES)
             counts, exact = samples[cell].discriminative, table.exact[cell]
             met = len(episodes_of[cell[0]])
             cell_scores.append(CellScore(*cell, policy, met, qoi, score, regrets, more, counts, exact))
@@ -147,7 +148,7 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     standings = []
     for policy, values in overall.items():
         found = {
-            key: interval(numbers, links, within=(0, 1) if key == "improvement" else REALS)
+            key: interval(numbers, links, within=SHARES if key in ("improvement", "regret") else REALS)
             for key, numbers in values.items()
         }
         standings.append(Standing(policy, unranked.get(policy, ""), found))

@@ -67,7 +67,7 @@ COLUMNS = (
     Column("policy", "policy", str),
     Column("L", "capacity", str),
     Column("QoI", "qoi", score),
-    Column("regret", "regret", lambda share: decimal(100 * share, 2, "%")),
+    Column("regret", "regret", percent),
     Column("delivered", "delivered", partial(decimal, digits=1)),
     Column("dropped", "dropped", partial(decimal, digits=1)),
     Column("longest gap (x)", "longest_gap", score),
@@ -104,10 +104,18 @@ def means(rows: RunRows, unranked: Collection[str] = ()) -> list[dict[str, Any]]
             "policy": policy,
             "capacity": capacity,
             **{c.key: mean([row.get(c.key) for row in group]) for c in COLUMNS[2:]},
+            "regret": _regret(group),
         }
         for (capacity, policy), group in groups.items()
     ]
     return sorted(entries, key=lambda e: (e["capacity"], e["policy"] in unranked, -e["qoi"], e["policy"]))
+
+
+def _regret(rows: RunRows) -> float:
+    """Regret over all rows together, as ``score.regret`` has it; NaN where none is known."""
+    known = [row for row in rows if row.get("regret") is not None and not math.isnan(row["regret"])]
+    best = math.fsum(row["clairvoyant"] for row in known)
+    return math.fsum(row["regret"] * row["clairvoyant"] for row in known) / best if best > 0 else math.nan
 
 
 def with_equal_rows(rows: RunRows, unranked: Collection[str] = ()) -> dict[str, list[str]]:

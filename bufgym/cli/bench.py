@@ -36,6 +36,7 @@ from bufgym.cli.scenarios import (
     WorkloadOptions,
 )
 from bufgym.utils.errors import BufgymError
+from bufgym.utils.progress import bar
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison
@@ -75,26 +76,35 @@ def bench(
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
     drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
+    mcap: Annotated[Path | None, Parameter(group=RESULTS)] = None,
 ) -> None:
     """Run policies side by side on the same episodes.
 
     Args:
         drops: With --workload: write each message that each policy dropped to this CSV file.
+        mcap: With --workload RECORDING: write what each policy delivers and drops, and its queue, to this MCAP file
+            (of the first trace, L and seed), for Foxglove and rerun.
     """
     from bufgym.benchmark.compare import compare
     from bufgym.benchmark.tasks import topics
+    from bufgym.traces.formats.splits import is_recording
 
     load_policies(who.policy_file)
     options = ScenarioOptions(stream, workload, interruption, own, shared)
     command = _command(suite, who, options, buffer, out)
     if suite.suite is not None:
-        frozen = options.given() | given(buffer) | ({} if drops is None else {"drops": drops})
+        frozen = options.given() | given(buffer)
+        frozen |= {name: value for name, value in (("drops", drops), ("mcap", mcap)) if value is not None}
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
         experiment = _on_suite(suite, who, given(shared), command)
     else:
         refuse(given(suite), "needs --suite")
         if drops is not None and workload.workload is None:
             raise BufgymError("--drops needs --workload")
+        if mcap is not None and (workload.workload is None or mcap.suffix != ".mcap"):
+            raise BufgymError(f"--mcap {mcap}: must be FILE.mcap, and needs --workload")
+        if mcap is not None and not all(map(is_recording, workload.workload or [])):
+            raise BufgymError(f"--mcap {mcap}: needs a recording that holds the messages themselves (MCAP, ROS bag)")
         experiment = _on_scenario(options, buffer, who.seeds)
     entrants, rival = who.entrants(experiment.task), who.rival()
     topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
@@ -113,9 +123,13 @@ def bench(
     if suite.suite is not None:
         print(done.plain)
     else:
-        print(f"\n{done.plain}" if experiment.recorded else done)
+        print(
+            done.about.removeprefix(experiment.arguments["about"]) + f"\n{done.plain}" if experiment.recorded else done
+        )
     if experiment.recorded:
         _print_drops(done, entrants, experiment, capacity, drops)
+    if mcap is not None:
+        _write_playback(mcap, workload.workload or [], entrants, experiment, capacity[0])
     if topic_policy is not None:
         by_topic = topics.by_topic(done.rows, topic_policy)
         print(f"\n{topic_policy}, topic by topic: means over episodes\n{by_topic}")
@@ -162,13 +176,13 @@ def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], com
 def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
     from bufgym.benchmark.tasks import task_for
 
-    scenario, lines, label, recorded = options.scenario(asked_seeds)
+    scenario, lines, label, recorded, facts = options.scenario(asked_seeds)
     if task_for(scenario).kind != "queue":
         refuse(given(buffer), "is for one queue")
     of_a_queue = given(buffer, "max_bytes", "decide_at") | ({"bound": False} if buffer.no_bound else {})
     task = task_for(scenario, **of_a_queue)
     seeds = asked_seeds or (1 if recorded else task.seeds)
-    about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds)]
+    about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds), *facts]
     arguments = {"seeds": seeds, "label": label, "about": "\n".join(about)}
     return Experiment(scenario, task, {**arguments, **of_a_queue}, recorded)
 
@@ -214,6 +228,20 @@ def _print_drops(
         print("\n" + drops.by_topic(counts, scenario, list(best_first), seeds * len(scenario.traces)))
     if file is not None:
         print(f"\n{counts.total()} dropped messages in {file}")
+
+
+def _write_playback(
+    file: Path, recording: Sequence[str], players: Sequence[Policy], experiment: Experiment, capacity: int
+) -> None:
+    """Write an episode of a recording as the policies would have sent it."""
+    from bufgym.benchmark.playback import write_playback
+
+    settings = {name: value for name, value in experiment.arguments.items() if name in ("max_bytes", "decide_at")}
+    with bar(None, True, "message") as advance:
+        counts = write_playback(file, recording, players, experiment.on, capacity, advance=advance, **settings)
+    print(f"\nwrote {file}, L = {capacity}:")
+    for name, (delivered, dropped) in counts.items():
+        print(f"  /{name}/delivered/...: {delivered:,}, /{name}/dropped/...: {dropped:,}, /{name}/queue")
 
 
 CLIENT = Group.create_ordered("Or a client of your own")

@@ -60,6 +60,7 @@ Count = Annotated[int, checked(int, lambda number: number >= 1, "a whole number 
 Bytes = Annotated[
     int, checked(bytes_of, lambda number: number >= 1, "a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB")
 ]
+Holes = Literal["hold", "zero", "refuse"]
 _RATE = "bytes/s > 0, or as in 20Mbit/s"
 Rate = Annotated[float, checked(lambda text: rate_of(text) or float(text), lambda rate: 0 < rate < math.inf, _RATE)]
 Natural = Annotated[int, checked(int, lambda number: number >= 0, "a whole number >= 0")]

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
-from bufgym.cli.options import Bytes, Count, Least0, Positive, Whole, given, refuse
+from bufgym.cli.options import Bytes, Count, Holes, Least0, Positive, Whole, given, refuse
 from bufgym.cli.trace_bags import MOTION, MotionOptions, RecordingOptions, workload_lines
 from bufgym.utils import modules
 from bufgym.utils.errors import BufgymError, printable
 from bufgym.utils.progress import bar
 
 if TYPE_CHECKING:
-    from bufgym.traces import Motion
+    from bufgym.traces import Motion, Trace
 
 _PARAMETERS = {"trace": "traces", "fps": "rate_hz", "bytes": "size_bytes", "seconds": "duration_s"}
 """Options whose scenario parameter has another name. Options not given take the scenario's defaults, and text is read
@@ -26,7 +26,8 @@ there."""
 _MESSAGES = ("fps", "bytes", "size_cv", "sizes", "seconds", "jitter")
 """Options of a made stream, which a recording has itself."""
 
-_OF_A_CLIENT = ("trace", "motion", "scale")  # Options that a client of one's own takes too
+_MOST_FACTS = 3  # Recordings whose facts stand above a table
+_OF_A_CLIENT = ("trace", "motion", "scale", "holes")  # Options that a client of one's own takes too
 
 
 @Parameter(name="*")
@@ -39,6 +40,8 @@ class LinkOptions:
     """Motion recordings, likewise (default: shipped drives); 'none': x is the frame index."""
     scale: Positive | None = None
     """Multiply the link's capacity (default: 1)."""
+    holes: Holes | None = None
+    """Where a trace has no samples: hold the rate before (default), send nothing, or refuse the file."""
 
 
 @Parameter(name="*", group=Group.create_ordered("The stream and its link (default: as in bufgym/Uplink-v0)"))
@@ -68,8 +71,9 @@ class StreamOptions(LinkOptions):
 @Parameter(name="*", group=Group.create_ordered("A recording of a robot in place of the stream"))
 @dataclass(frozen=True)
 class WorkloadOptions(RecordingOptions):
-    workload: str | None = None
-    """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; alone, played once from the start of each trace."""
+    workload: list[str] | None = None
+    """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; several are one drive; alone, played once from the start of each
+    trace."""
 
 
 @Parameter(name="*", group=Group.create_ordered("One interruption of unknown length T instead"))
@@ -124,6 +128,8 @@ class Described(NamedTuple):
     """Its name in rows."""
     recorded: bool = False
     """Whether it plays a recording."""
+    facts: Sequence[str] = ()
+    """Lines on the recordings that the user named."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +186,22 @@ class ScenarioOptions:
 
 
 def _parameters(options: StreamOptions, *names: str) -> dict[str, Any]:
-    return {_PARAMETERS.get(name, name): value for name, value in given(options, *names).items()}
+    from bufgym.scenario.checks import names_in
+
+    parameters = {_PARAMETERS.get(name, name): value for name, value in given(options, *names).items()}
+    holes = parameters.pop("holes", None)
+    if holes is not None:
+        if options.trace is None:
+            raise BufgymError("--holes needs --trace")
+        parameters["traces"] = [_over_holes(name, holes) for text in options.trace for name in names_in(text)]
+    return parameters
+
+
+def _over_holes(name: str, holes: Holes) -> Trace | str:
+    """The trace of a file; what is no file has no holes."""
+    from bufgym import traces
+
+    return traces.read_trace(name, holes=holes) if Path(name).is_file() else name
 
 
 def _registered(options: OwnOptions) -> str:
@@ -206,10 +227,17 @@ def _uplink(stream: StreamOptions, measured: MotionOptions) -> Described:
         settings["motion"] = _motions(stream.motion, measured)
     if stream.motion == ["none"]:
         settings = {"value": qoi.exponential(), **settings}
-    return Described(scenarios.get("lte", **settings))
+    scenario: Any = scenarios.get("lte", **settings)
+    named = [*(scenario.traces if stream.trace else ()), *(scenario.motion if stream.motion else ())]
+    facts = [
+        f"{printable(one.name)}: {'; '.join(f'{name} {value}' for name, value in one.sheet.facts)}"
+        for one in named[:_MOST_FACTS]
+        if one.sheet.facts
+    ]
+    return Described(scenario, facts=facts)
 
 
-def recorded(file: str, stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
+def recorded(files: Sequence[str], stream: StreamOptions, recording: RecordingOptions, seeds: int | None) -> Described:
     """Make a workload as recorded; with --seeds it starts at random places of each trace."""
     from bufgym import scenario as scenarios
     from bufgym.model import qoi
@@ -217,14 +245,14 @@ def recorded(file: str, stream: StreamOptions, recording: RecordingOptions, seed
 
     refuse(given(stream, *_MESSAGES), "cannot go with --workload: a recording has its own")
     with bar(None, True, "message") as advance:
-        workload = read_workload(file, **recording.arguments(), advance=advance)
+        workload = read_workload(files, **recording.arguments(), advance=advance)
     motions = _motions(stream.motion or [], recording)
     if recording.odom is None and not motions:
         refuse(given(recording, *MOTION), "needs --odom or --motion")
     by_motion = bool(motions) or workload.x is not None
     settings: dict[str, Any] = {
         "value": qoi.exponential(math.exp(-1)) if by_motion else qoi.exponential(),
-        **_parameters(stream, "trace", "scale", "tells_duration", "value"),
+        **_parameters(stream, "trace", "scale", "holes", "tells_duration", "value"),
         **{"motion": motions, "random_offset": seeds is not None, "workload": workload},
     }
     lines = [printable(workload.source), "", *workload_lines(workload), ""]

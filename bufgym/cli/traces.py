@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from bufgym.cli.options import columns
+from bufgym.cli.options import Holes, columns
 from bufgym.utils.errors import BufgymError, TraceError, printable
 from bufgym.utils.libraries import library
 
@@ -22,23 +23,49 @@ _MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates
 
 
 Files = Annotated[list[str], Parameter(help="A file, or a shipped name.")]
-Format = Annotated[str | None, Parameter(help="The files' format (default: detected).")]
-Column = Annotated[
-    str | None,
-    Parameter(
-        help="Of UCC files (DL_bitrate, UL_bitrate), of iperf3 --bidir (upload, download), or which run of a list."
-    ),
-]
 
 
-def info(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ReadOptions:
+    format: str | None = None
+    """The files' format (default: detected)."""
+    column: str | None = None
+    """Of UCC files (DL_bitrate, UL_bitrate), of iperf3 --bidir (upload, download), or which run of a list."""
+    time: str | None = None
+    """Of any table: the column of times, by name or number; with --rate."""
+    rate: str | None = None
+    """The column of rates."""
+    unit: str = "bit/s"
+    """Unit of the rates: B/s, kB/s, Mbit/s, ..."""
+    time_unit: str = ""
+    """Unit of the times: s, ms, us, ns (default: that in the column's name, else s)."""
+    holes: Holes = "hold"
+    """Stretches without samples: hold the rate before, send nothing ("zero"), or refuse."""
+
+    def load(self, name: str) -> Trace:
+        """The trace of this name or file."""
+        from bufgym import traces
+
+        columns = None
+        if self.time is not None and self.rate is not None:
+            columns = traces.Columns(self.time, self.rate, self.unit, self.time_unit)
+        elif self.time != self.rate:
+            raise BufgymError("--time and --rate go together")
+        return traces.load(name, self.format, column=self.column, columns=columns, holes=self.holes)
+
+
+Read = ReadOptions()
+
+
+def info(files: Files, /, *, read: ReadOptions = Read) -> int:
     """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
 
     failed = 0
     for k, name in enumerate(files):
         try:
-            trace = traces.load(name, format, column=column)
+            trace = read.load(name)
         except TraceError as error:
             failed += 1
             print(f"bufgym: error: {error}", file=sys.stderr)
@@ -48,18 +75,21 @@ def info(files: Files, /, *, format: Format = None, column: Column = None) -> in
             for key, number in traces.describe(trace).items()
         ]
         knots = ("knots", f"{len(trace.time_us)}")
-        print("\n" * (k > failed) + f"{printable(trace.name)}\n{columns([('source', trace.source), knots, *lines])}")
+        print(
+            "\n" * (k > failed)
+            + f"{printable(trace.name)}\n{columns([('source', trace.source), *trace.sheet.facts, knots, *lines])}"
+        )
     return 2 if failed else 0
 
 
-def validate(files: Files, /, *, format: Format = None, column: Column = None) -> int:
+def validate(files: Files, /, *, read: ReadOptions = Read) -> int:
     """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
 
     failed = 0
     for name in files:
         try:
-            trace = traces.load(name, format, column=column)
+            trace = read.load(name)
         except TraceError as error:
             failed += 1
             print(f"error  {error}")
@@ -71,7 +101,7 @@ def validate(files: Files, /, *, format: Format = None, column: Column = None) -
     return 1 if failed else 0
 
 
-def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format = None, column: Column = None) -> None:
+def convert(files: Files, /, *, out: Path, to: str | None = None, read: ReadOptions = Read) -> None:
     """Write bandwidth traces in another format and name the loss.
 
     Args:
@@ -85,7 +115,7 @@ def convert(files: Files, /, *, out: Path, to: str | None = None, format: Format
         option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
         raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
     for name, target in _targets(files, out, to):
-        trace = traces.load(name, format, column=column)
+        trace = read.load(name)
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
         print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
@@ -108,18 +138,17 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
     return targets
 
 
-def plot(files: Files, /, *, out: Path, format: Format = None, column: Column = None) -> None:
+def plot(files: Files, /, *, out: Path, read: ReadOptions = Read) -> None:
     """Draw bandwidth traces (needs the extra 'plot').
 
     Args:
         out: The picture to write: .png, .svg or .pdf.
     """
-    from bufgym import traces
 
     figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
-    loaded = [traces.load(name, format, column=column) for name in files]
+    loaded = [read.load(name) for name in files]
     figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):

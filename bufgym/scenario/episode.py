@@ -15,8 +15,9 @@ from bufgym.model.link import FOREVER, MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import MAX_ACK_DELAY_US, Topic
 from bufgym.scenario.arrivals import check_messages, read_only, sealed
-from bufgym.traces.workload import MAX_MESSAGES
 from bufgym.utils.errors import BufgymError
+
+_MAX_SEEN = 10**7  # Messages times their consumers; more would not fit into memory
 
 
 class Streams(NamedTuple):
@@ -90,7 +91,7 @@ class Episode:
         n = len(arrivals)
         whole("first_decision", self.first_decision)
         whole("last_decision", self.last_decision, 0, 2**62)
-        whole("consumers", self.consumers, 1, MAX_MESSAGES // n)
+        whole("consumers", self.consumers, 1, max(1, _MAX_SEEN // n))
         check_end(self.ends_us)
         for name, size_bytes in self.encodings.items():
             if np.shape(size_bytes) != (n,):

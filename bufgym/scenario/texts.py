@@ -26,3 +26,10 @@ def motions_by_name(motions: Sequence[Motion]) -> str:
 def how_rated(scenario: Any) -> str:
     """How the episodes of one queue are rated."""
     return f"QoI = 1 + sum of V(step in x) over the messages received; V = {printable(scenario.value.name)}."
+
+
+def doubts(scenario: Any) -> list[str]:
+    """A line for each doubt about a recording that the scenario plays."""
+    scenario = getattr(scenario, "uplink", scenario)
+    played = [*getattr(scenario, "traces", ()), *getattr(scenario, "motion", ()), getattr(scenario, "workload", None)]
+    return [f"warning: {doubt}" for one in played if one is not None for doubt in one.sheet.doubts]

@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bufgym.jit import kernel
+from bufgym.traces.plausible import NOISE, NOISE_POSES, doubt_of_noise
 from bufgym.traces.poses import Poses, angles, gaps_between, longest_s, unit
+from bufgym.traces.sheet import NONE, Facts, Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array, first_true, freeze
 from bufgym.utils.errors import BufgymError
 
@@ -52,6 +54,8 @@ class Motion:
     """Where it comes from, in words."""
     gaps: tuple[tuple[int, int], ...] = ()
     """(start, end) in microseconds of stretches without a pose, across which motion is taken as even."""
+    sheet: Sheet = NONE
+    """Facts and doubts."""
 
     def __post_init__(self) -> None:
         time_us = np.array(self.time_us)
@@ -145,22 +149,52 @@ def motion_from_poses(
     exactly of norm 1.
     """
     settings = settings or MotionSettings()
-    gaps = gaps_between(poses.time_us, settings.max_gap_s)
+    gaps, recorded = gaps_between(poses.time_us, settings.max_gap_s), poses
     # A recording at just this rate jitters by some percent, and must not be resampled for that.
     if np.median(np.diff(poses.time_us)) < 0.9 * US_PER_S / settings.rate_hz:
         poses = poses.resampled(settings.rate_hz)
     else:
         poses = replace(poses, quaternion=unit(poses.quaternion))
-    return Motion(name, poses.time_us, np.append(0.0, np.cumsum(motion_steps(poses, settings))), source, gaps)
+    turned, moved = _steps(poses, settings)
+    motion = Motion(name, poses.time_us, np.append(0.0, np.cumsum(turned + moved)), source, gaps)
+    shares = {} if not motion.total else {k: _share(poses, settings, k) / motion.total for k in _compared(poses)}
+    doubt = doubt_of_noise(shares, motion.total)
+    facts = _facts(recorded, motion, settings, turned, moved)
+    share_fact = ("x of every second", f"{shares.get(2, 1):.2f} of x, of {len(poses.time_us):,} poses compared")
+    return replace(motion, sheet=Sheet((*facts, share_fact), (doubt,) if doubt else ()))
 
 
-def motion_steps(poses: Poses, settings: MotionSettings) -> Float64Array:
-    """Motion from each pose to the next, float64[n-1]: rotation / field of view + translation / scene scale."""
-    return np.concatenate([_steps(piece, settings) for piece in poses.pieces()])
+def _compared(poses: Poses) -> list[int]:
+    """Every how many poses x is summed again: those of the noise rule that are at most a second, and 2."""
+    most = US_PER_S / float(np.median(np.diff(poses.time_us)))
+    return [k for k in NOISE if k == min(NOISE) or k <= most] if len(poses.time_us) >= NOISE_POSES else []
 
 
-def _steps(poses: Poses, settings: MotionSettings) -> Float64Array:
-    turned_rad = angles(poses.quaternion[:-1], poses.quaternion[1:])
-    moved_m = np.linalg.norm(np.diff(poses.position_m, axis=0), axis=1)
-    steps: Float64Array = turned_rad / math.radians(settings.fov_deg) + moved_m / settings.scene_scale_m
-    return steps
+def _share(poses: Poses, settings: MotionSettings, k: int) -> float:
+    """Motion by every ``k``-th pose alone."""
+    some = Poses(poses.time_us[::k], poses.position_m[::k], poses.quaternion[::k])
+    return float(sum(part.sum() for part in _steps(some, settings)))
+
+
+def _steps(poses: Poses, settings: MotionSettings) -> tuple[Float64Array, Float64Array]:
+    """Rotation / field of view and translation / scene scale from each pose to the next, float64[n-1] each."""
+    turned = [angles(piece.quaternion[:-1], piece.quaternion[1:]) for piece in poses.pieces()]
+    moved = [np.linalg.norm(np.diff(piece.position_m, axis=0), axis=1) for piece in poses.pieces()]
+    return np.concatenate(turned) / math.radians(settings.fov_deg), np.concatenate(moved) / settings.scene_scale_m
+
+
+def _facts(poses: Poses, motion: Motion, settings: MotionSettings, turned: Float64Array, moved: Float64Array) -> Facts:
+    """Facts of recorded poses, and of both parts of x from each compared pose to the next."""
+    steps_s, duration_s = np.diff(motion.time_us) / US_PER_S, motion.duration_us / US_PER_S
+    path_m, turned_deg, moved_m = poses.path_m(), turned * settings.fov_deg, moved * settings.scene_scale_m
+    even = steps_s >= 0.5 * float(np.median(steps_s))  # the last step of a grid may be short
+    fastest, turning = (float((parts / steps_s)[even].max()) for parts in (moved_m, turned_deg))
+    return (
+        *time_facts("poses", poses.time_us, poses.start_us),
+        ("path", f"{path_m:,.6g} m, {moved_m.sum() / duration_s:.4g} m/s (mean), at most {fastest:.4g}"),
+        (
+            "turned",
+            f"{turned_deg.sum():,.6g} degrees, {turned_deg.sum() / duration_s:.4g} a second, at most {turning:.4g}",
+        ),
+        ("x", f"{moved.sum():.3f} by translation, {turned.sum():.3f} by rotation"),
+    )

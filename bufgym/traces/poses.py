@@ -29,6 +29,13 @@ class Poses:
     """float64[n, 4], unit; any order of the four, q and -q being the same orientation."""
     format: str = ""
     """What they were read from."""
+    start_us: int = 0
+    """Time 0 by the recording's clock, microseconds."""
+
+    def path_m(self) -> float:
+        """Length of the way from pose to pose, m."""
+        steps = (np.linalg.norm(np.diff(piece.position_m, axis=0), axis=1).sum() for piece in self.pieces())
+        return float(sum(steps))
 
     def at(self, time_us: Int64Array) -> Poses:
         """The poses at these times, int64[m] within the recording: position linear, orientation by slerp."""
@@ -135,6 +142,12 @@ def rotations(quaternion: Float64Array) -> Float64Array:
         cross[:, i, j], cross[:, j, i] = -vector[:, k], vector[:, k]
     # Rodrigues: 1 + 2 w [v] + 2 [v]^2.
     return np.asarray(np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross, np.float64)
+
+
+def product(a: Float64Array, b: Float64Array) -> Float64Array:
+    """First turned by b, then by a: products of quaternions (x, y, z, w), each float64[m, 4]."""
+    vector = a[:, 3:] * b[:, :3] + b[:, 3:] * a[:, :3] + np.cross(a[:, :3], b[:, :3])
+    return np.column_stack([vector, a[:, 3] * b[:, 3] - np.sum(a[:, :3] * b[:, :3], axis=1)])
 
 
 def _same_side(a: Float64Array, b: Float64Array) -> Float64Array:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.links import read_trace
 from bufgym.traces.formats.motions import read_motion
+from bufgym.traces.formats.tables import Columns
 from bufgym.traces.generate.rules import steady
 from bufgym.traces.motion import Motion
-from bufgym.traces.trace import After, Trace
+from bufgym.traces.trace import After, Holes, Trace
 from bufgym.utils import files
 from bufgym.utils.units import rate_of
 
@@ -47,19 +48,22 @@ def shipped() -> dict[str, Path]:
 
 
 def load(
-    name_or_path: StrPath, format: str | None = None, after: After = "loop", *, column: str | None = None
+    name_or_path: StrPath,
+    format: str | None = None,
+    after: After = "loop",
+    *,
+    column: str | None = None,
+    columns: Columns | None = None,
+    holes: Holes = "hold",
 ) -> Trace:
     """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
 
     A shipped name takes precedence, then a file.
-
-    Raises:
-        TraceError: neither a shipped name nor a file (the message lists the names), or a broken file.
     """
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:
         return replace(steady(rate), name=os.fspath(name_or_path))
-    return read_trace(_resolve(name_or_path), format, after, column=column)
+    return read_trace(_resolve(name_or_path), format, after, column=column, columns=columns, holes=holes)
 
 
 def load_motion(name_or_path: StrPath) -> Motion:

@@ -10,17 +10,19 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from bufgym.traces.sheet import NONE, Sheet
 from bufgym.utils.errors import BufgymError
 
 Int64Array = npt.NDArray[np.int64]
 Float64Array = npt.NDArray[np.float64]
 After = Literal["loop", "hold", "stop"]
+Holes = Literal["hold", "zero", "refuse"]
 
 US_PER_S: Final = 1_000_000
 
@@ -56,6 +58,10 @@ class Trace:
     """After the last knot: "loop" begins again, "hold" continues at the last segment's rate, "stop" carries nothing."""
     source: str = ""
     """Where it comes from, in words, with the file's format."""
+    holes: tuple[tuple[int, int], ...] = ()
+    """(start, end) in microseconds of stretches without a sample, each from a usual step after the last one on."""
+    sheet: Sheet = NONE
+    """Facts and doubts."""
 
     def __post_init__(self) -> None:
         time_us = _whole_numbers(self.time_us, "time_us")
@@ -183,7 +189,19 @@ class Trace:
             raise self._broken(f"factor = {factor}: the total of {self.total_bytes} bytes would pass 2**62")
         # Multiplying and rounding both preserve order, so the counts cannot start to decrease.
         cumulative = np.rint(self.cumulative_bytes * factor).astype(np.int64)
-        return Trace(self.name, self.time_us, cumulative, self.after, f"{self.source} x {factor:g}".strip())
+        return replace(self, cumulative_bytes=cumulative, source=f"{self.source} x {factor:g}".strip())
+
+    def with_holes(self, how: Holes) -> Trace:
+        """The trace with the rate before each hole held in it, or nothing sent."""
+        time_us = np.union1d(self.time_us, np.array(self.holes, np.int64).ravel())
+        cumulative = np.rint(np.interp(time_us, self.time_us, self.cumulative_bytes)).astype(np.int64)
+        counts = cumulative[1:] - cumulative[:-1]
+        for start_us, end_us in self.holes:
+            first, last = np.searchsorted(time_us, [start_us, end_us])
+            lengths_us = np.diff(time_us[first - 1 : last + 1])
+            rate = 0.0 if how == "zero" else counts[first - 1] / lengths_us[0]
+            counts[first:last] = np.rint(rate * lengths_us[1:])
+        return replace(self, time_us=time_us, cumulative_bytes=_from_zero(counts))
 
     @classmethod
     def from_intervals(

@@ -7,10 +7,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from bufgym.traces.poses import longest_s
+from bufgym.traces.sheet import NONE, Sheet
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array, freeze
 from bufgym.utils.errors import BufgymError
 
-MAX_MESSAGES: Final = 10**7
+MAX_MESSAGES: Final = 10**9  # A month of 400 messages a second; more is a mistake
 MAX_MESSAGE_BYTES: Final = 10**10
 
 
@@ -44,6 +45,8 @@ class Workload:
     """Where it comes from, in words."""
     gaps: tuple[tuple[int, int], ...] = ()
     """(start, end) in microseconds of stretches without a pose, across which motion was taken as even."""
+    sheet: Sheet = NONE
+    """Facts and doubts."""
 
     def __post_init__(self) -> None:
         arrival, size = np.array(self.arrival_us), np.array(self.size_bytes)

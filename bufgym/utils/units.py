@@ -5,8 +5,17 @@ from fractions import Fraction
 
 _NUMBER = r"([0-9]+\.?[0-9]*(?:[eE][0-9]{1,2})?)\s*"
 _BYTES = re.compile(_NUMBER + r"(?:([kKMG]?)(i?)B)?")
-_RATE = re.compile(_NUMBER + r"(?:([kKMG]?)(bit|B)/s|([kKMG]?)(b)ps)")
+_RATE = re.compile(_NUMBER + "([a-zA-Z/]+)")
 _POWERS = {"": 0, "k": 1, "K": 1, "M": 2, "G": 3}
+_PER_S = {"bit/s": 0.125, "bits/sec": 0.125, "bps": 0.125, "B/s": 1.0, "Bps": 1.0}
+
+RATES = {
+    "bytes_per_s": 1.0,
+    **{letter + name: 1000.0 ** _POWERS[letter] * size for letter in _POWERS for name, size in _PER_S.items()},
+    "mbps": 125_000.0,
+    "mbit/s": 125_000.0,
+}
+"""Unit of a rate -> bytes per second. Case tells: b is a bit and B a byte; only m for mega has no other meaning."""
 
 
 def bytes_of(text: str) -> int:
@@ -26,9 +35,6 @@ def bytes_of(text: str) -> int:
 
 
 def rate_of(text: str) -> float | None:
-    """Bytes per second of a rate with its unit (bit/s, bps or B/s, with k, M or G before it); None for other text."""
+    """Bytes per second of a rate with its unit, one of `RATES`; None for other text."""
     match = _RATE.fullmatch(text)
-    if match is None:
-        return None
-    count = Fraction(match[1]) * 1000 ** _POWERS[match[2] or match[4] or ""]
-    return float(count if match[3] == "B" else count / 8)
+    return None if match is None or match[2] not in RATES else float(Fraction(match[1]) * Fraction(RATES[match[2]]))

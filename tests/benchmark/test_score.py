@@ -316,3 +316,17 @@ def test_policies_that_no_row_tells_apart_are_one_line() -> None:
     # One that does not compete is a line of its own, whatever its rows.
     unbounded = [{**entry, "policy": "rosbridge"} for entry in BASE]
     assert table.with_equal_rows([*BASE, *unbounded], ["rosbridge"]) == {}
+
+
+def test_the_table_and_the_page_have_one_regret_and_its_interval_is_a_share() -> None:
+    """Of H 9 and 1 where 10 and 2 are best, 2 of 12 are lost, and not the mean of 0.1 and 0.5."""
+    rows = []
+    for seed, (h, best) in enumerate([(9.0, 10.0), (1.0, 2.0), (10.0, 10.0)]):
+        for policy, own in (("drop-oldest", h / 2), ("mine", h)):
+            about = {"scenario": "s", "capacity": 4, "policy": policy, "seed": seed, "trace": "t", "qoi": own}
+            rows.append({**about, "clairvoyant": best, "certified": True, "regret": 1 - own / best})
+    table_has = {entry["policy"]: entry["regret"] for entry in table.means(rows)}
+    assert table_has["mine"] == pytest.approx(2 / 22)
+    for cell in score.scores(rows).cells:
+        assert cell.regret.value == pytest.approx(table_has[cell.policy])
+        assert 0 <= cell.regret.low <= cell.regret.value <= cell.regret.high <= 1

@@ -3,8 +3,10 @@
 A failure names the seed and the number of its input. Each night has 10,000 files of each kind and 1,000 command lines.
 """
 
+import bz2
 import gzip
 import io
+import lzma
 import os
 import random
 import shutil
@@ -55,7 +57,11 @@ def poses(folder: Path) -> Kind:
     motion = "t_s,motion\n" + "".join(f"{k / 10},{k / 7}\n" for k in range(30))
     kitti = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(3))
     (folder / "k_times.txt").write_text("0\n0.1\n0.2\n")
-    texts = {"p.txt": tum, "e.csv": euroc, "m.csv": motion, "k.txt": kitti}
+    names = "stamp [ms],id,px,py,qx,qy,qz,qw\n" + "".join(f"{k * 100},7,{k},0,0,0,0,1\n" for k in range(30))
+    fixes = "".join(f"$GPGGA,1200{k:02},4500.{k:04},N,00700.0,W,1,08,1,100.0,M,0,M,,*47\n" for k in range(30))
+    gpsd = '{"class":"TPV","mode":3,"time":"2024-01-31T12:00:01Z","lat":45.0,"lon":-7.0,"alt":1.5}\n'
+    texts = {"p.txt": tum, "e.csv": euroc, "m.csv": motion, "k.txt": kitti, "n.csv": names, "g.nmea": fixes}
+    texts["g.json"] = gpsd + gpsd.replace("00:01Z", "00:02Z")
     return [(name, text.encode()) for name, text in texts.items()], lambda path, uniform: read_motion(path)
 
 
@@ -75,6 +81,17 @@ def bags(folder: Path) -> Kind:
         cases.write_rosbag2(folder / "f", drive, StoragePlugin.SQLITE3, CompressionMode.MESSAGE) / "metadata.yaml",
         cases.write_rosbag2(folder / "g", drive, StoragePlugin.SQLITE3, CompressionMode.FILE) / "g.db3.zstd",
     ]
+
+    sound = files[0].read_bytes()
+    for name, packed in (
+        ("h.gz", gzip.compress(sound)),
+        ("i.xz", lzma.compress(sound)),
+        ("j.bz2", bz2.compress(sound)),
+    ):
+        files.append(folder / name)
+        files[-1].write_bytes(packed)
+    files.append(folder / "joined.mcap")
+    files[-1].write_bytes(sound + sound)
 
     def read(path: Path, uniform: random.Random) -> object:
         return read_workload(path.parent if path.parent.name in "fg" else path, odom="/odom", bridge_gaps=True)

@@ -30,4 +30,13 @@ SAMPLES = {
     "iperf3": '{"intervals":[{"sum":{"start":0,"end":1.5,"bytes":3000}},\n{"sum":{"start":1.5,"end":2,"bytes":7}}]}',
     "runs": "####\nRun 1\n8,16,0\n####\nRun 3\n0.5,1.5\n8,4\n",
     "sabre": '[\n{"duration_ms": 725, "bandwidth_kbps": 36014},\n{"duration_ms": 1000, "bandwidth_kbps": 16}\n]\n',
+    "iperf-text": "[ ID] Interval       Transfer     Bandwidth\n[  3]  0.0- 1.0 sec  1.25 MBytes  10.5 Mbits/sec\n"
+    "[  3]  1.0- 2.0 sec  128 KBytes  1.05 Mbits/sec\n[  3]  0.0- 2.0 sec  1.38 MBytes  5.77 Mbits/sec\n",
+    "mm-link": "# mahimahi mm-link (uplink) [a] > b\n# base timestamp: 3\n3 # 1504\n4 + 1504\n4 - 1504 1\n7 # 1504\n",
+    "proc-net-dev": "Inter-|   Receive                |  Transmit\n face |bytes    packets|bytes\n1700000000.5\n"
+    "    lo:  1 0 0 0 0 0 0 0 1 0 0 0 0 0 0 0\n wlan0: 500 5 0 0 0 0 0 0 1000 9 0 0 0 0 0 0\n1700000001.5\n"
+    " wlan0: 700 5 0 0 0 0 0 0 3000 9 0 0 0 0 0 0\n1700000003.5\n wlan0: 900 5 0 0 0 0 0 0 3500 9 0 0 0 0 0 0\n",
+    "mmcli": "bearer.stats.duration : 10\nbearer.stats.bytes-rx : 7\nbearer.stats.bytes-tx : 100\n"
+    "bearer.stats.duration : 12\nbearer.stats.bytes-rx : 9\nbearer.stats.bytes-tx : 700\n"
+    "bearer.stats.duration : 13\nbearer.stats.bytes-rx : 9\nbearer.stats.bytes-tx : 700\n",
 }

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from needs import needs
-from recording_cases import fetched
+from recording_cases import ODD_FILES, fetched
 from refusal_cases import refuse
+from ros_cases import made
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
@@ -187,9 +188,6 @@ def test_times_records_chunks_and_counts_out_of_all_proportion(tmp_path: Path, m
     refused(many, "more than 19 topics")
     drive = rosbag2(StoragePlugin.SQLITE3, CompressionMode.MESSAGE)(tmp_path / "drive")
     assert len(read_bag(drive).time_ns) == 9
-    monkeypatch.setattr(bags, "MAX_BAG_MESSAGES", 8)
-    refused(drive, "more than 8 messages: must be fewer")
-    monkeypatch.setattr(bags, "MAX_BAG_MESSAGES", 9)
     monkeypatch.setattr(bag_files, "MAX_CHUNK_BYTES", 1000)
     with sqlite3.connect(drive / "drive.db3") as base:
         base.execute("UPDATE messages SET data = ?", (zstandard.compress(bytes(2000)),))
@@ -267,3 +265,71 @@ def test_real_recordings() -> None:
         workload = workload_from_bag(bag, topics=[odom], bridge_gaps=True)
         assert workload.duration_us / 1e6 == pytest.approx(seconds, abs=0.05)
         assert workload.x is not None and workload.x[-1] > 1
+
+
+def transforms(*of: tuple[str, str, float, float]) -> bytes:
+    """A TFMessage of (parent, child, x in m, yaw in degrees)."""
+    stamped = []
+    for parent, child, x_m, yaw_deg in of:
+        half = math.radians(yaw_deg) / 2
+        turn = made(cases.ROS2, "geometry_msgs/msg/Quaternion", z=math.sin(half), w=math.cos(half))
+        place = made(cases.ROS2, "geometry_msgs/msg/Vector3", x=x_m)
+        moved = made(cases.ROS2, "geometry_msgs/msg/Transform", translation=place, rotation=turn)
+        header = made(cases.ROS2, "std_msgs/msg/Header", frame_id=parent)
+        stamped.append(
+            made(cases.ROS2, "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=moved)
+        )
+    message = cases.ROS2.types["tf2_msgs/msg/TFMessage"](transforms=stamped)
+    return bytes(cases.ROS2.serialize_cdr(message, "tf2_msgs/msg/TFMessage"))
+
+
+def test_a_chain_of_transforms_is_one(tmp_path: Path) -> None:
+    """The robot goes 1 m a second in odom, which turns by 90 degrees in the first second; the camera is 1 m ahead.
+
+    So in the map the camera is at (1, 0), after half a second at 45 degrees 1.5 m away, then at (0, 2) and (0, 3).
+    """
+    tf = "tf2_msgs/msg/TFMessage"
+    entries = [(0, "/tf_static", tf, transforms(("base", "camera", 1, 0)))]
+    for k in (0, 1, 2, 4):
+        corrected = [("map", "odom", 0, 45 * k)] if k in (0, 2) else []
+        entries.append((500 * k, "/tf", tf, transforms(*corrected, ("odom", "base", 0.5 * k, 0))))
+    path = cases.write_mcap(tmp_path / "tf.mcap", entries)
+    poses = read_bag(path, "/tf:map:camera").poses
+    assert poses is not None and poses.time_us.tolist() == [0, 500_000, 1_000_000, 2_000_000]
+    half = 1.5 * math.sqrt(0.5)
+    np.testing.assert_allclose(poses.position_m, [[1, 0, 0], [half, half, 0], [0, 2, 0], [0, 3, 0]], atol=1e-12)
+    assert poses.format == "/tf, map -> odom -> base -> camera"
+    for odom in ("/tf", "/tf:camera:map", "/tf:map:arm", "/tf:base:camera"):
+        refuse("say which frames: /tf:map:odom, /tf:odom:base .or of a chain, from its first", read_bag, path, odom)
+
+
+def test_odd_transforms() -> None:
+    """199 steps of 0.03 m in a motion capture's own type; and over a chain of tf with 9 corrections of 0.02 m."""
+    for name, odom, total_m in (("vicon.mcap", "/vicon/r", 5.97), ("tf_chain.mcap", "/tf:map:base_link", 6.15)):
+        workload = read_workload(ODD_FILES / "turn7" / name, odom=odom)
+        assert workload.x is not None and workload.x[-1] == pytest.approx(total_m / 2)
+
+
+def test_satellite_fixes_are_metres_in_a_plane(tmp_path: Path) -> None:
+    """A minute of arc north at 45 degrees is 1852.2 m on the meridian of WGS 84, one east 1314.2 m; one is no fix."""
+    entries = []
+    for k, (latitude, longitude, status) in enumerate(
+        ((45, 7, 0), (0, 0, -1), (45 + 1 / 60, 7, 0), (45, 7 + 1 / 60, 0))
+    ):
+        about = made(cases.ROS2, "sensor_msgs/msg/NavSatStatus", status=status)
+        fix = made(
+            cases.ROS2,
+            "sensor_msgs/msg/NavSatFix",
+            latitude=latitude,
+            longitude=longitude,
+            altitude=100.0,
+            status=about,
+        )
+        data = bytes(cases.ROS2.serialize_cdr(fix, "sensor_msgs/msg/NavSatFix"))
+        entries.append((1000 * k, "/gps/fix", "sensor_msgs/msg/NavSatFix", data))
+    path = cases.write_mcap(tmp_path / "gps.mcap", entries)
+    with pytest.warns(TraceWarning, match="pose 2 of 3 .* is 1852"):
+        poses = read_bag(path, "/gps/fix").poses
+    assert poses is not None and "satellite receiver, no orientation" in poses.format
+    np.testing.assert_allclose(np.linalg.norm(poses.position_m, axis=1), [0, 1852.2, 1314.2], rtol=1e-4)
+    assert poses.position_m[1, 1] > 1852 and poses.position_m[2, 0] > 1314

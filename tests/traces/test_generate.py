@@ -239,6 +239,7 @@ def test_a_file_in_full(tmp_path: Path) -> None:
 MESSAGES = st.tuples(st.integers(0, 10**9), st.integers(1, 10**10), st.integers(0, 2), st.floats(0, 1e6))
 
 
+@pytest.mark.filterwarnings("ignore:.*no message for:bufgym.utils.errors.TraceWarning")
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(messages=st.lists(MESSAGES, min_size=1), names=st.booleans(), moves=st.booleans())
 def test_a_round_trip(tmp_path: Path, messages: list[tuple[int, int, int, float]], names: bool, moves: bool) -> None:

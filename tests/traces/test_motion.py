@@ -67,7 +67,7 @@ def test_times_in_ns_are_exact_and_a_file_written_is_read_back(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("block_bytes", [7, 40, 2**20])
-def test_a_block_of_coordinates_and_its_lines_are_the_same(
+def test_blocks_of_any_size_give_the_same_coordinates(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
 ) -> None:
     """Two coordinates of one time, of which the last counts; the last lines break a rule, one in each file."""
@@ -84,9 +84,8 @@ def test_a_block_of_coordinates_and_its_lines_are_the_same(
             return [str(error)]
         return [motion.time_us.tolist(), motion.coordinate.tolist(), motion.source]
 
-    monkeypatch.setattr("bufgym.traces.formats.text._BLOCK_BYTES", block_bytes)
     blocks = [read(path) for path in files]
-    monkeypatch.setattr("bufgym.traces.formats.motions._motion_block", lambda block, previous: None)
+    monkeypatch.setattr("bufgym.traces.formats.text._BLOCK_BYTES", block_bytes)
     assert blocks == [read(path) for path in files]
     assert blocks[0][:2] == [[0, 100_000, 700_000, 2_000_000], [0, 0.4 - 0.1, 1.25 - 0.1, 1.25 - 0.1]]
     assert all(", line 8" in str(fault) or ", line 10" in str(fault) for (fault,) in blocks[1:])

@@ -7,6 +7,8 @@ bytes of CDR around each.
 import asyncio
 import shutil
 import sqlite3
+import tarfile
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from unittest.mock import Mock
@@ -24,7 +26,7 @@ import zstandard
 from mcap.writer import CompressionType
 from recording_cases import ODD_FILES
 
-from bufgym.traces import read_bag, read_workload
+from bufgym.traces import read_bag, read_motion, read_trace, read_workload
 from bufgym.traces.formats.bags import messages
 from bufgym.utils.errors import TraceWarning
 
@@ -208,7 +210,7 @@ def test_without_metadata_files_come_in_order_of_time(tmp_path: Path, storage: s
     more.write_bytes(b"")
     refuse(r"more\.mcap: holds no recording: must be fixed, or left out", read_bag, tmp_path / "bag")
     cases.write_ros1(tmp_path / "one.bag", [(0, "/t", STRING, cases.text("x", cases.ROS1))]).rename(more)
-    refuse(r"more\.mcap: holds no recording", read_bag, tmp_path / "bag")
+    refuse(r"more\.mcap: must be a recording of the same storage as", read_bag, tmp_path / "bag")
     write(tmp_path / ("one.db3" if storage == "mcap" else "one.mcap"), rows(0)).rename(more)
     refuse(r"\.\w+: must be a recording of the same storage as", read_bag, tmp_path / "bag")
 
@@ -276,3 +278,73 @@ def test_what_the_commands_say(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "  yes  std_msgs/msg/String and nav_msgs/msg/Odometry" in listed
     for command in (["info", plain], ["info", tmp_path], ["from-poses", plain]):
         fails(["trace", *command], "is a recording of messages, whose topics `bufgym trace from-bag` lists", capsys)
+
+
+def test_files_joined_are_read_as_one() -> None:
+    """Two drives of 100 messages in one MCAP file, packed as it came; two ROS 1 bags of one drive, in either order."""
+    folder = ODD_FILES / "turn7"
+    with pytest.warns(TraceWarning, match=r"cat2\.mcap\.gz: holds 2 MCAP files, joined: all are read"):
+        assert len(read_bag(folder / "cat2.mcap.gz").time_ns) == 200
+    bags = [folder / "ros1_split" / f"d_{k}.bag.gz" for k in (1, 0)]
+    assert [len(read_bag(bag).time_ns) for bag in bags] == [100, 100]
+    assert len(read_bag(bags, "/odom").time_ns) == 200
+    with pytest.warns(TraceWarning, match=r"its files are read in order of time: d_0\.bag\.gz, d_1\.bag\.gz$"):
+        bag = read_bag(folder / "ros1_split", "/odom")
+    assert (bag.kind, len(bag.time_ns)) == ("ros1", 200)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "db3"])
+def test_bytes_behind_the_end_of_a_file_are_said(tmp_path: Path, suffix: str) -> None:
+    if suffix == "bag":
+        entries = [(k, "/t", STRING, cases.text("x", cases.ROS1)) for k in range(12)]
+        path = cases.write_ros1(tmp_path / "a.bag", entries)
+    else:
+        path = write(tmp_path / f"a.{suffix}", rows(*range(12)))
+    path.write_bytes(path.read_bytes() + b"more")
+    with pytest.warns(TraceWarning, match=rf"a\.{suffix}: 4 bytes follow its end.*: they are not read"):
+        assert len(read_bag(path).time_ns) == 12
+
+
+def test_gaps_and_overlaps_between_files_are_said(tmp_path: Path) -> None:
+    """The second file begins 2 s after the first has ended, and the third 1.5 s before that one ends."""
+    write(tmp_path / "a.mcap", rows(0, 1))
+    write(tmp_path / "b.mcap", rows(2001, 4001))
+    cases.write_mcap(tmp_path / "c.mcap", [(ms, "/other", STRING, cases.text("x")) for ms in (2501, 5001)])
+    says = (
+        r"a\.mcap: b\.mcap begins 2\.000 s after the end of a\.mcap; c\.mcap begins 1\.500 s before the end of b\.mcap"
+    )
+    with pytest.warns(TraceWarning, match=says), pytest.warns(TraceWarning, match="1 of 6 messages logged before"):
+        bag = read_bag([tmp_path / f"{name}.mcap" for name in "cab"])
+    assert ((bag.time_ns - cases.START_NS) // cases.MS).tolist() == [0, 1, 2001, 2501, 4001, 5001]
+    assert len(list(messages(bag))) == 6
+
+
+@pytest.mark.parametrize("module", ["gzip", "bz2", "lzma", "zstandard"])
+def test_packed_files_are_read(tmp_path: Path, module: str) -> None:
+    """A recording and a text; cut in the middle, the text is refused."""
+    compress = pytest.importorskip(module, reason=needs("extras", module)).compress
+    packed = tmp_path / "packed"
+    packed.write_bytes(compress(write(tmp_path / "a.mcap", rows(*range(12))).read_bytes()))
+    holds_all(packed)
+    text = b"".join(b"%d 8\n" % k for k in range(100_000))
+    packed.write_bytes(compress(text))
+    assert read_trace(packed).duration_us == 100_000 * 10**6
+    packed.write_bytes(packed.read_bytes()[:-100])
+    refuse(r"packed, line \d+: \w+ data damaged or cut off", read_trace, packed)
+
+
+def test_archives_are_named(tmp_path: Path) -> None:
+    plain = tmp_path / "a.csv"
+    plain.write_text("time_s,bytes_per_s\n0,1\n1,1\n")
+    for name, mode in (("a.tar", "w"), ("a.tgz", "w:gz"), ("a.txz", "w:xz")):
+        with tarfile.open(tmp_path / name, mode) as archive:
+            archive.add(plain, "a.csv")
+        refuse(rf"{name}: is a tar archive: must be unpacked first", read_trace, tmp_path / name)
+    for name, inside, says in (
+        ("a.xlsx", "[Content_Types].xml", "spreadsheet: must be saved as CSV"),
+        ("a.zip", "a.csv", "zip archive: must be unpacked"),
+    ):
+        with zipfile.ZipFile(tmp_path / name, "w") as packed:
+            packed.writestr(inside, "x")
+        for read in (read_trace, read_motion, read_workload):
+            refuse(rf"{name}: is a {says} first", read, tmp_path / name)

@@ -32,6 +32,9 @@ RIGHT: list[tuple[str, Any, str | None]] = [
     ("dst_slow.csv", (3605, 125_000 * 3603 + 250_000 * 2), "line 5: 2024-03-31 03:00:00 is 3601 s after the line"),
     ("ip_stream.json", (3, 375_000), None),
     ("cooked_epoch.txt", (10, 125_000 * 19), None),
+    # Bytes, not bits: 10 MB/s for 10 s.
+    ("MBps.csv", (10, 100_000_000), None),
+    ("KBps.csv", (10, 100_000_000), None),
 ]
 """File; seconds, and x or bytes at the end, or the error; the warning."""
 
@@ -121,7 +124,12 @@ def test_times_in_a_unit_that_cannot_be_are_refused(tmp_path: Path) -> None:
     header = "#timestamp [ns],p_x,...\n" + turning("us", ",", 0, True)
     for text, format in ((header, None), (turning("us", ",", 1_700_000_000, True), "euroc")):
         path = written(tmp_path, text, "path.csv")
-        refuse("median step of the times = '3.3e-05 s': must be at least 0.0001 s", read_motion, path, format=format)
+        rule = (
+            "'3.3e-05 s': must be at least 0.0001 s"
+            if format
+            else r"times are in ns, which .* us make .* must say \[us\]"
+        )
+        refuse(rule, read_motion, path, format=format)
     assert read_motion(written(tmp_path, header.replace("[ns]", "[us]"), "path.csv")).duration_us == 1_966_666
     refuse("median step of the times", read_motion, written(tmp_path, "t_s,motion\n0,0\n0.000001,1\n", "m.csv"))
 
@@ -152,13 +160,22 @@ def test_a_car_whose_poses_come_in_bursts_does_not_jump(tmp_path: Path) -> None:
         assert len(caught) == (step_m == 3)
 
 
+def test_poses_in_bursts_are_as_valid_as_others(tmp_path: Path) -> None:
+    """Two poses 3 us apart, 40 ms to the next two, and each goes 0.02 m: 299 steps, in fields of 2 m."""
+    motion = read_motion(ODD_FILES / "turn7" / "burst.txt")
+    assert (motion.total, motion.duration_us) == (pytest.approx(2.99), 5_960_003)
+    fast = "".join(f"{k * 3e-6:.6f} {k} 0 0 0 0 0 1\n" for k in range(300))
+    refuse("median step of the times = .3e-06 s", read_motion, written(tmp_path, fast, "fast.txt"))
+
+
 def test_the_command_says_a_warning_in_a_line(tmp_path: Path) -> None:
     path = written(tmp_path, "0 1\n1 1\n3601 1\n3602 1\n")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert main(["trace", "info", str(path)]) == 0
     line = (
-        f"bufgym: warning: {path}, line 3: 3601 is 3600 s after the line above, where 1 s is usual: the rate is held\n"
+        f"bufgym: warning: {path}, line 3: 3601 is 3600 s after the line above, where 1 s is usual: the rate is held, "
+        "mean 125 KB/s (--holes zero: 0.138773 KB/s)\n"
     )
     assert warnings.formatwarning(caught[0].message, caught[0].category, caught[0].filename, caught[0].lineno) == line
 
@@ -178,7 +195,9 @@ def test_rates_are_held_for_a_day_at_any_rate_and_holes_are_named(tmp_path: Path
         (300, 3600, True),
         (900, 3600, True),
         (1, 61, True),
-        (1, 59, False),
+        (1, 10, False),
+        (0.1, 2, False),
+        (0.1, 2.1, True),
         (1800, 3600, False),
         (1800, 5400, True),
         (3600, 7200, True),
@@ -203,6 +222,16 @@ def test_an_hour_that_comes_twice_is_said(tmp_path: Path) -> None:
     ):
         assert read_trace(written(tmp_path, "time,mbps\n" + lines)).duration_us == 4 * 3600 * 10**6
     assert read_trace(written(tmp_path, "0 8\n1 8\n1 8\n2 8\n")).duration_us == 3 * 10**6
+
+
+@pytest.mark.parametrize(("unit", "rate"), [("Mbps", 125_000), ("mbps", 125_000), ("kB/s", 1000), ("KBps", 1000)])
+def test_b_is_a_bit_and_capital_b_a_byte(tmp_path: Path, unit: str, rate: int) -> None:
+    assert read_trace(written(tmp_path, f"time,{unit}\n0,2\n1,2\n")).total_bytes == 4 * rate
+    refuse(
+        "unit of the rate = MBPS: b is a bit and B a byte: must be as Mbps or MBps",
+        read_trace,
+        written(tmp_path, "time,MBPS\n0,2\n1,2\n"),
+    )
 
 
 def test_a_comma_at_the_end_of_each_line_begins_no_column(tmp_path: Path) -> None:

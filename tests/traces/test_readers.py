@@ -60,6 +60,13 @@ BY_HAND = [
     # 3.125 MB are 3.125 * 2**20 = 3,276,800 bytes; 0.0625 MB are 65,536. Intervals follow each other, whatever their
     # stamps; the closing line is left out.
     ("nuttcp", NUTTCP, [(0, 0), (500_000, 3_276_800), (990_000, 3_276_800), (1_490_000, 3_342_336)]),
+    # MBytes are 2**20 bytes; the total over all is no interval.
+    ("iperf-text", SAMPLES["iperf-text"], [(0, 0), (S, 1_310_720), (2 * S, 1_441_792)]),
+    # Opportunities at ms 0 and 4 of the trace.
+    ("mm-link", SAMPLES["mm-link"], [(0, 0), (1000, 1500), (3000, 1500), (4000, 3000)]),
+    # 2,000 bytes sent in 1 s, then 500 in 2 s; 600 in 2 s, none in 1 s. A counter says nothing of what follows.
+    ("proc-net-dev", SAMPLES["proc-net-dev"], [(0, 0), (S, 2000), (3 * S, 2500)]),
+    ("mmcli", SAMPLES["mmcli"], [(0, 0), (2 * S, 600), (3 * S, 600)]),
     # Intervals but those that iperf3 omits.
     ("iperf3", IPERF3, [(0, 0), (1_000_167, 5_473_440), (1_144_206, 5_473_440)]),
 ]
@@ -217,15 +224,24 @@ BROKEN = [
     ("time_s,bytes_per_s\n", "is empty: must hold a line for each sample"),
     (UCC_HEADER + "2019.13.16_13.40.04,0,1,20,D\n", "line 2: Timestamp = 2019.13.16_13.40.04: must be a time"),
     (UCC_HEADER + f"{DAY}.04,0,1,1,D\n{DAY}.10,0,1,1,D\n", f"line 3: Timestamp = {DAY}.10: must be at most 5 s after"),
-    ("1,Mbits/sec\n1,MBytes/sec\n", "line 2: unit = MBytes/sec: must be one of bits/sec, Kbits/sec"),
+    (
+        "1,Mbits/sec\n1,MBytes/sec\n",
+        "line 2: 1,MBytes/sec: must be a line of nyu .number,unit with a unit such as Mbits/sec",
+    ),
     ("[", "line 1: must be JSON"),
     ('[{"duration_ms": 1, "bandwidth_kbps": 1}', r"line 1: must be JSON \(Expecting ',' delimiter"),
     ('[\n{"duration_ms": true}]', "lte.csv, item 1: True: must hold duration_ms, a number"),
     ('[{"duration_ms": 0, "bandwidth_kbps": 1}]', "item 1: duration_ms = 0: must be above 0"),
     ('[{"duration_ms": NaN}]', ": must be JSON .NaN: numbers must be finite"),
     ("[" * 100_000, ": must be JSON .nested too deep"),
-    ("nuttcp-t: v8.1.4: error from server\n", "line 1: .*error from server.*: must be a run that succeeded"),
-    (BEGUN + "1e300 MB / 1.00 sec = 8.3886 Mbps\n", "line 2: .*: must be an interval, MB / sec = Mbps, or a remark"),
+    (
+        "nuttcp-t: v8.1.4: error from server\n",
+        "line 1: .*error from server.*: must be a line of nuttcp .* of a run that succeeded",
+    ),
+    (
+        BEGUN + "1e300 MB / 1.00 sec = 8.3886 Mbps\n",
+        "line 2: .*: must be a line of nuttcp .MB / sec = Mbps and remarks",
+    ),
     ('{"intervals": [], "error": "unable to connect"}', "error = 'unable to connect': must be a run that succeeded"),
     ('{"intervals": [3]}', "item 1: 3: must hold sum, an object"),
     ('{"intervals": [\n{"sum": {"start": 0, "end": 1}}]}', "item 1: .*: must hold bytes, a number"),
@@ -278,7 +294,7 @@ def test_a_format_must_be_known_and_said_where_two_fit(tmp_path: Path, monkeypat
     monkeypatch.setitem(FORMATS, "seconds", seconds)
     os.mkfifo(tmp_path / "pipe")
     for source, format, says in (
-        (path, "pcap", "format = 'pcap': must be one of mahimahi, csv, mbit, belgium, rates, ucc"),
+        (path, "pcap", "format = 'pcap': must be one of mahimahi, mbit, rates, ucc"),
         (path, None, r"fits more than one format \(mahimahi, seconds\): say which with format="),
         (tmp_path / "nothing.csv", "csv", r"nothing\.csv: no such file"),
         (tmp_path, "csv", "is a directory"),

@@ -65,6 +65,7 @@ def test_the_recordings_of_the_tests_agree_with_the_table(name: str) -> None:
 
 
 @pytest.mark.nightly
+@pytest.mark.filterwarnings("ignore:.*the rate is held:bufgym.utils.errors.TraceWarning")
 @pytest.mark.parametrize("name", SETS)
 def test_recorded_links_agree_with_the_table(name: str) -> None:
     data_set, pattern, format = SETS[name]

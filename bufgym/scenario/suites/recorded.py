@@ -10,7 +10,7 @@ from bufgym.scenario.afr_evaluation import LINK, evaluation
 from bufgym.scenario.suites.suite import Build, Setting, Suite
 from bufgym.scenario.suites.synthetic import SIZE_BYTES, TRACES, both_sizes, both_values
 from bufgym.traces import Motion, markov_link, read_motion, read_trace
-from bufgym.traces.formats.speed_tests import runs_of
+from bufgym.traces.formats.logs import runs_of
 from bufgym.utils.errors import BufgymError
 
 _TUM = {

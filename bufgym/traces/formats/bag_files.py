@@ -13,9 +13,10 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.traces.formats.definitions import BagTopic, ros_type
+from bufgym.traces.formats.packed import unzstd
 from bufgym.utils.files import unpacked_limit
 
 if TYPE_CHECKING:
@@ -25,13 +26,15 @@ if TYPE_CHECKING:
 MAX_CHUNK_BYTES: Final = 2**28
 MAX_TOPICS: Final = 10_000
 BETWEEN_TYPES: Final = " and "
+MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 
 _RECORD: Final = struct.Struct("<BQ")  # an MCAP record's kind and length
 _MESSAGE: Final = struct.Struct("<HIQQ")  # bagTopic, sequence number, when it was logged and when it was published, ns
-_PIECE_BYTES: Final = 2**20
 
 Message = tuple[BagTopic, int, bytes]
 """Its channel, when it was logged in ns, and its serialised form."""
+Doubt = Callable[[str], object]
+"""Called with words on a file that was read and may still be wrong."""
 
 
 class RefusedError(ValueError):
@@ -58,18 +61,33 @@ class _Bounded(io.BufferedReader):
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path))
-        self._left = self.size = os.fstat(self.fileno()).st_size
+        self.left = self.size = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1) -> bytes:
-        if self.ends_early and size is not None and size > self._left:
+        if self.ends_early and size is not None and size > self.left:
             raise EOFError
-        data = super().read(self._left if size is None or size < 0 else min(size, self._left))
-        self._left -= len(data)
+        data = super().read(self.left if size is None or size < 0 else min(size, self.left))
+        self.left -= len(data)
         return data
 
 
-def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
-    """Every message of an MCAP file; adds every topic to ``types``, even without messages."""
+def mcap(path: Path, types: dict[str, str], doubt: Doubt = str) -> Iterator[Message]:
+    """Every message of an MCAP file, or of several joined; adds every topic to ``types``, even without messages."""
+    with _Bounded(path) as file:
+        unpacked, count = Unpacked(file.size), 0
+        while True:
+            yield from _one_mcap(file, unpacked, types)
+            count += 1
+            if not file.peek(len(MCAP_MAGIC)).startswith(MCAP_MAGIC):
+                break
+        if count > 1:
+            doubt(f"holds {count} MCAP files, joined: all are read")
+        if file.left:
+            doubt(f"{file.left:,} bytes follow its end: they are not read")
+
+
+def _one_mcap(file: _Bounded, unpacked: Unpacked, types: dict[str, str]) -> Iterator[Message]:
+    """The messages up to the end that the file says it has."""
     from mcap import records
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
@@ -88,22 +106,20 @@ def mcap(path: Path, types: dict[str, str]) -> Iterator[Message]:
             publisher, encoding = record.metadata.get("callerid", ""), record.message_encoding
             channels[record.id] = BagTopic(record.topic, type, encoding, definition, language, record.id, publisher)
 
-    with _Bounded(path) as file:
-        unpacked = Unpacked(file.size)
-        reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES)
-        for record in _ours_may_end(reader.records, file):
-            declared(record)
-            if isinstance(record, records.Message):
-                yield channels[record.channel_id], record.log_time, record.data
-            elif isinstance(record, records.Chunk):
-                for kind, content in _records(_chunk(record, unpacked)):
-                    if kind == Opcode.MESSAGE:
-                        number, _, logged_ns, _ = _MESSAGE.unpack_from(content)
-                        yield channels[number], logged_ns, bytes(content[_MESSAGE.size :])
-                    elif kind == Opcode.SCHEMA:
-                        declared(records.Schema.read(ReadDataStream(io.BytesIO(content))))
-                    elif kind == Opcode.CHANNEL:
-                        declared(records.Channel.read(ReadDataStream(io.BytesIO(content))))
+    reader = StreamReader(file, emit_chunks=True, record_size_limit=MAX_CHUNK_BYTES)
+    for record in _ours_may_end(reader.records, file):
+        declared(record)
+        if isinstance(record, records.Message):
+            yield channels[record.channel_id], record.log_time, record.data
+        elif isinstance(record, records.Chunk):
+            for kind, content in _records(_chunk(record, unpacked)):
+                if kind == Opcode.MESSAGE:
+                    number, _, logged_ns, _ = _MESSAGE.unpack_from(content)
+                    yield channels[number], logged_ns, bytes(content[_MESSAGE.size :])
+                elif kind == Opcode.SCHEMA:
+                    declared(records.Schema.read(ReadDataStream(io.BytesIO(content))))
+                elif kind == Opcode.CHANNEL:
+                    declared(records.Channel.read(ReadDataStream(io.BytesIO(content))))
 
 
 def _ours_may_end(records: Iterator[Any], file: _Bounded) -> Iterator[Any]:
@@ -113,7 +129,7 @@ def _ours_may_end(records: Iterator[Any], file: _Bounded) -> Iterator[Any]:
             file.ends_early = file.ends_early or getattr(record, "library", "") == "bufgym"
             yield record
     except EOFError:
-        return
+        file.left = 0  # a part of a record
 
 
 def _records(chunk: bytes) -> Iterator[tuple[int, memoryview]]:
@@ -151,37 +167,13 @@ def _chunk(chunk: Any, unpacked: Unpacked) -> bytes:
     return data
 
 
-def unzstd(packed: bytes, most_bytes: int) -> bytes:
-    """Decompress to at most a piece more than ``most_bytes``."""
-    data = bytearray()
-    for piece in unzstd_pieces(io.BytesIO(packed)):
-        data += piece
-        if len(data) > most_bytes:
-            break
-    return bytes(data)
-
-
-def unzstd_pieces(packed: IO[bytes]) -> Iterator[bytes]:
-    """Decompress in pieces; EOFError where less comes out than the data say."""
-    import zstandard
-
-    says = zstandard.frame_content_size(packed.read(18))  # a frame's header is no longer; -1 where it does not say
-    packed.seek(0)
-    with zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(packed, read_across_frames=True) as reader:
-        while piece := reader.read(_PIECE_BYTES):
-            says -= len(piece)
-            yield piece
-    if says > 0:
-        raise EOFError(f"zstd data end {says} bytes early")
-
-
 def _add(types: dict[str, str], topic: str, type: str) -> None:
     """Note a topic's type; two publishers may send different types on one topic, which then has both."""
     known = [name for name in types.get(topic, "").split(BETWEEN_TYPES) if name]
     types[topic] = BETWEEN_TYPES.join(known if type in known or not type else [*known, type])
 
 
-def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
+def sqlite(path: Path, types: dict[str, str], doubt: Doubt = str) -> Iterator[Message]:
     """Every message of one of rosbag2's SQLite files; one with a journal must be a copy, because SQLite changes it."""
     import sqlite3  # few read such files, and all that read a trace look whether it is a recording
 
@@ -207,6 +199,9 @@ def sqlite(path: Path, types: dict[str, str]) -> Iterator[Message]:
             if not isinstance(logged_ns, int) or not isinstance(data, bytes):
                 raise RefusedError("a message's time must be a whole number, and its data bytes")
             yield channels[number], logged_ns, data
+        pages, page_bytes = (base.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
+        if (left := path.stat().st_size - pages * page_bytes) > 0:
+            doubt(f"{left:,} bytes follow its end: they are not read")
 
 
 def _definitions(base: "sqlite3.Connection") -> Iterator[tuple[str, tuple[str, str]]]:
@@ -227,7 +222,7 @@ def journals(path: Path) -> list[str]:
     return [ending for ending, file in files.items() if file.is_file() and file.stat().st_size]
 
 
-def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
+def ros1(path: Path, types: dict[str, str], doubt: Doubt = str) -> Iterator[Message]:
     """Every message of a ROS 1 bag."""
     from rosbags.rosbag1 import Reader
     from rosbags.rosbag1.reader import IndexData
@@ -238,8 +233,20 @@ def ros1(path: Path, types: dict[str, str]) -> Iterator[Message]:
         def __lt__(self, other: Any) -> bool:
             return (self.chunk_pos, self.offset) < (other.chunk_pos, other.offset)
 
-    with Reader(path) as reader:
+    class _ToItsEnd(Reader):
+        """Notes where the bag ends by its own word."""
+
+        ends_at = path.stat().st_size
+
+        def read_chunk_info(self) -> Any:
+            about = super().read_chunk_info()
+            self.ends_at = self.bio.tell()  # type: ignore[union-attr]  # is open
+            return about
+
+    with _ToItsEnd(path) as reader:
         unpacked = Unpacked(path.stat().st_size)
+        if (left := path.stat().st_size - reader.ends_at) > 0:
+            doubt(f"{left:,} bytes follow its end, as where bags were joined: they are not read (give each as a file)")
         for place, chunk in reader.chunks.items():
             reader.chunks[place] = chunk._replace(decompressor=_limited(chunk.decompressor, unpacked))
         channels: dict[int, BagTopic] = {}

@@ -1,8 +1,9 @@
-"""Poses from the messages of one topic of a recording: odometry, poses, or one transform of tf."""
+"""Poses from the messages of one topic of a recording: odometry, poses, satellite fixes, or a chain of tf."""
 
 import itertools
 import math
 import re
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -13,13 +14,19 @@ from bufgym.traces.formats.definitions import TF_TYPES, check_definition, check_
 from bufgym.traces.formats.definitions import BagTopic as BagTopic
 from bufgym.traces.formats.definitions import typestore as typestore
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault
+from bufgym.traces.formats.geodesy import local_plane
 from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
-from bufgym.traces.poses import Poses, unit
+from bufgym.traces.poses import Poses, product, rotations, unit
 from bufgym.traces.trace import Float64Array, Int64Array
 from bufgym.utils.errors import BufgymError
 
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
-_POSE_TYPES: Final = (ODOMETRY, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_POSE_TYPES: Final = (
+    ODOMETRY,
+    *(f"geometry_msgs/msg/{name}" for name in ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped")),
+)
+NAV_SAT_FIX: Final = "sensor_msgs/msg/NavSatFix"
+TF_STATIC: Final = "/tf_static"
 # Names of topics on which a pose is where a robot shall go, or what a person says. The page's frames.js has them too.
 _GOAL: Final = re.compile(
     r"(^|[/_])(goals?|targets?|(way|set)_?points?|clicked|desired|cmd|command|(goal|target|set|initial)_?pose)"
@@ -28,6 +35,9 @@ _GOAL: Final = re.compile(
 _PUBLISHER: Final = re.compile(r"([^:@]+)@([0-9]{1,4})(|:.*)")
 # Robots have dozens of transforms; an error message lists no more than these.
 _LISTED_FRAMES: Final = 8
+_CHAIN: Final = 2  # Frames of a transform, or of a chain of them: the first and the last
+_VALUES: Final = 7  # Position and quaternion
+_MOST_OF_FIX: Final = (90.0, 180.0, 1e5)  # degrees, degrees, m
 
 Frames = tuple[str, str]
 """The frame in which a pose is, and the frame whose pose it is (empty where the message does not say)."""
@@ -36,6 +46,11 @@ Frames = tuple[str, str]
 def carries_poses(topic: str, type: str) -> bool:
     """Whether the messages of this topic say where a robot is; a goal does not."""
     return type in TF_TYPES or type == ODOMETRY or (type in _POSE_TYPES and not is_goal(topic))
+
+
+def carries_motion(topic: str, type: str) -> bool:
+    """Whether the messages of this topic say how a robot moved: poses, or fixes of a satellite receiver."""
+    return type == NAV_SAT_FIX or carries_poses(topic, type)
 
 
 def is_goal(topic: str) -> bool:
@@ -58,6 +73,8 @@ def placed(message: Any) -> Iterator[tuple[Any, Frames, Any, Any]]:
     for stamped in getattr(message, "transforms", ()):
         pose = stamped.transform
         yield stamped.header, _frames(stamped), pose.translation, pose.rotation
+    if hasattr(message, "transform"):
+        yield message.header, _frames(message), message.transform.translation, message.transform.rotation
     if hasattr(message, "pose"):
         pose = message.pose
         while hasattr(pose, "pose"):
@@ -86,10 +103,21 @@ class PoseCollector:
         self._file: Path | None = None
         self._numbers: dict[int, int] = {}  # of a channel in this file -> publisher, from 1 in order of first messages
         self._publishers: dict[int, str] = {}  # their names
-        self._poses: dict[tuple[Frames, int], list[tuple[int, tuple[float, ...]]]] = {}
+        self._poses: dict[tuple[Frames, int], tuple[array[int], array[float]]] = {}  # times in ns, seven values each
+        self._static: dict[Frames, list[float]] = {}
+        self._is_fix = False
+
+    def wants(self, topic: str) -> bool:
+        """Whether the messages of this topic are to be added."""
+        return topic == self.topic or (topic == TF_STATIC and len(self._frames) == _CHAIN)
 
     def add(self, file: Path, channel: BagTopic, time_ns: int, data: bytes) -> None:
         """Keep the poses of a message in this file that was logged at `time_ns`."""
+        if channel.topic != self.topic:
+            if channel.type in TF_TYPES:
+                for _, frames, position, orientation in placed(self._decoded(channel, data)):
+                    self._static[frames] = self._checked_values(TF_STATIC, position, orientation)
+            return
         self._count += 1
         if file != self._file:
             self._file, self._numbers = file, {}
@@ -97,7 +125,12 @@ class PoseCollector:
         self._publishers.setdefault(number, channel.publisher)
         if self._publisher not in (None, number):
             return
-        for _, frames, position, orientation in placed(self._decoded(channel, data)):
+        message = self._decoded(channel, data)
+        if channel.type == NAV_SAT_FIX:
+            self._is_fix = True
+            self._keep_fix((_frames(message), number), time_ns, message)
+            return
+        for _, frames, position, orientation in placed(message):
             self._keep((frames, number), time_ns, position, orientation)
 
     def poses(self, topics: dict[str, str]) -> tuple[int, Poses]:
@@ -106,12 +139,18 @@ class PoseCollector:
             raise BufgymError(f"{self.path}: no topic {self.topic!r}; it has: {', '.join(topics) or 'none'}")
         known = sorted({frames for frames, _ in self._poses})
         fitting = [frames for frames in known if frames[: len(self._frames)] == self._frames]
-        if len(fitting) != 1:
+        chain = self._chain() if not fitting and len(self._frames) == _CHAIN else []
+        if len(fitting) != 1 and not chain:
             names = [f"{self.topic}:{':'.join(filter(None, frames))}" for frames in known]
             more = f" and {len(names) - _LISTED_FRAMES} more" if len(names) > _LISTED_FRAMES else ""
-            what = "has no pose" if not names else f"say which frames: {', '.join(names[:_LISTED_FRAMES])}{more}"
+            chains = " (or of a chain, from its first frame to its last)" if len({*sum(known, ())}) > _CHAIN else ""
+            what = (
+                "has no pose" if not names else f"say which frames: {', '.join(names[:_LISTED_FRAMES])}{more}{chains}"
+            )
             raise BufgymError(f"{self.path}: odom = {self._spec!r}: {what}")
-        times_ns, values = self._of_one_publisher(fitting[0])
+        times_ns, values = self._joined(chain) if chain else self._of_one_publisher(fitting[0])
+        if self._is_fix:
+            values[:, :3] = local_plane(values[:, :3])
         from_ns = int(times_ns[0])
         time_us = (times_ns - from_ns) // 1000
         left_out = LeftOut()
@@ -122,7 +161,37 @@ class PoseCollector:
             raise BufgymError(f"{self.path}: odom = {self.topic!r} has 1 pose{count}: needs at least 2")
         note = left_out.said(self.path, f"poses on {self.topic}", "pose")
         positions, quaternions = values[last, :3], unit(values[last, 3:])
-        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{note}")
+        about = ", positions of a satellite receiver, no orientation" if self._is_fix else ""
+        about = f", {' -> '.join([chain[0][0], *(child for _, child in chain)])}" if chain else about
+        return from_ns, Poses(time_us[last], positions, quaternions, f"{self.topic}{about}{note}", from_ns // 1000)
+
+    def _chain(self) -> list[Frames]:
+        """The transforms from the first frame asked for down to the second; empty if they are not connected."""
+        above = {child: parent for parent, child in [*self._static, *(frames for frames, _ in self._poses)]}
+        chain, (top, frame) = list[Frames](), self._frames
+        while frame != top and frame in above and len(chain) <= len(above):
+            chain.insert(0, (above[frame], frame))
+            frame = above[frame]
+        moving = any(frames in chain for frames, _ in self._poses)
+        return chain if frame == top and moving else []
+
+    def _joined(self, chain: list[Frames]) -> tuple[Int64Array, Float64Array]:
+        """Poses of a chain of transforms when its most frequent one was sent, the others interpolated to then.
+
+        Before its first and after its last a rarer one is held, as a map's correction is by its users.
+        """
+        static = [frames for frames in chain if frames in self._static and (frames, 1) not in self._poses]
+        moving = {frames: self._of_one_publisher(frames) for frames in chain if frames not in static}
+        times_ns = max((times_ns for times_ns, _ in moving.values()), key=len)
+        place, turn = np.zeros((len(times_ns), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(times_ns), 1))
+        for frames in chain:
+            if frames in moving:
+                values = _at(*moving[frames], times_ns)
+            else:
+                values = np.tile(self._static[frames], (len(times_ns), 1))
+            place += np.einsum("nij,nj->ni", rotations(turn), values[:, :3])
+            turn = product(turn, unit(values[:, 3:]))
+        return times_ns, np.hstack([place, turn])
 
     def _of_one_publisher(self, frames: Frames) -> tuple[Int64Array, Float64Array]:
         """Times in ns and values of the poses in these frames, in order of time.
@@ -130,24 +199,24 @@ class PoseCollector:
         Publishers that follow each other, as when a node was started again, count as one.
         """
         by_number = {number: poses for (other, number), poses in self._poses.items() if other == frames}
-        spans = sorted((min(poses)[0], max(poses)[0]) for poses in by_number.values())
+        spans = sorted((min(times_ns), max(times_ns)) for times_ns, _ in by_number.values())
         if any(begin <= end for (_, end), (begin, _) in itertools.pairwise(spans)):
             names = self._publishers
             listed = [
-                f"{self.topic}@{number} ({len(poses):,} poses{names[number] and f' by {names[number]}'})"
+                f"{self.topic}@{number} ({len(poses[0]):,} poses{names[number] and f' by {names[number]}'})"
                 for number, poses in sorted(by_number.items())
             ]
             more = f" and {len(listed) - _LISTED_FRAMES} more" if len(listed) > _LISTED_FRAMES else ""
             what = f"{len(listed)} publishers send at once: say which: {', '.join(listed[:_LISTED_FRAMES])}{more}"
             raise BufgymError(f"{self.path}: odom = {self._spec!r}: {what}")
-        poses = [pose for poses in by_number.values() for pose in poses]
-        times_ns = np.array([time_ns for time_ns, _ in poses], np.int64)
+        times_ns = np.concatenate([np.array(times_ns, np.int64) for times_ns, _ in by_number.values()])
+        values = np.concatenate([np.array(values).reshape(-1, _VALUES) for _, values in by_number.values()])
         order = np.argsort(times_ns, kind="stable")
-        return times_ns[order], np.array([values for _, values in poses])[order]
+        return times_ns[order], values[order]
 
     def _decoded(self, channel: BagTopic, data: bytes) -> Any:
-        if not carries_poses(channel.topic, channel.type):
-            rule = f"must be one of {', '.join(_POSE_TYPES)}, {', '.join(TF_TYPES)}"
+        if not carries_motion(channel.topic, channel.type):
+            rule = f"must be one of {', '.join((*_POSE_TYPES, *TF_TYPES, NAV_SAT_FIX))}"
             raise BufgymError(f"{self.path}: {self.topic} carries {channel.type or 'no known type'}: {rule}")
         if channel.encoding not in ("cdr", "ros1"):
             raise BufgymError(f"{self.path}: {self.topic} is encoded in {channel.encoding!r}: must be cdr or ros1")
@@ -166,14 +235,39 @@ class PoseCollector:
             raise fault(self.path, f"message {self._count} on {self.topic} is {rule}: {words}") from error
 
     def _keep(self, source: tuple[Frames, int], time_ns: int, position: Any, quaternion: Any) -> None:
-        poses = self._poses.setdefault(source, [])
-        field = f"{self.topic}, pose {len(poses) + 1}"
-        values = (position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w)
+        times_ns, kept = self._poses.setdefault(source, (array("q"), array("d")))
+        kept.extend(self._checked_values(f"{self.topic}, pose {len(times_ns) + 1}", position, quaternion))
+        times_ns.append(time_ns)
+
+    def _keep_fix(self, source: tuple[Frames, int], time_ns: int, fix: Any) -> None:
+        """Keep a fix, for now as latitude, longitude and altitude; the receiver says where it has none."""
+        if fix.status.status < 0 or math.isnan(fix.latitude + fix.longitude):
+            return
+        times_ns, kept = self._poses.setdefault(source, (array("q"), array("d")))
+        values = (fix.latitude, fix.longitude, 0.0 if math.isnan(fix.altitude) else fix.altitude)
+        if not all(abs(value) <= most for value, most in zip(values, _MOST_OF_FIX, strict=True)):
+            rule = "must be latitude, longitude and altitude: within 90 and 180 degrees, and 100 km"
+            raise fault(self.path, rule, value=values, field=f"{self.topic}, fix {len(times_ns) + 1}")
+        kept.extend((*values, 0.0, 0.0, 0.0, 1.0))
+        times_ns.append(time_ns)
+
+    def _checked_values(self, field: str, position: Any, quaternion: Any) -> list[float]:
+        values = [position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w]
         # Written so that NaN fails.
         if not all(abs(value) <= MAX_POSITION_M for value in values[:3]):
             rule = f"must be finite and within {MAX_POSITION_M:g} m"
-            raise fault(self.path, rule, value=values[:3], field=f"{field}, position")
+            raise fault(self.path, rule, value=tuple(values[:3]), field=f"{field}, position")
         norm = math.hypot(*values[3:])
         if not abs(norm - 1) <= NORM_TOLERANCE:
             raise fault(self.path, "must be 1 within 1 %", value=f"{norm:.6g}", field=f"{field}, norm")
-        poses.append((time_ns, values))
+        return values
+
+
+def _at(own_ns: Int64Array, values: Float64Array, times_ns: Int64Array) -> Float64Array:
+    """Poses interpolated to these times; the first and the last are held."""
+    is_last = np.append(own_ns[1:] != own_ns[:-1], True)
+    own_ns, values = own_ns[is_last], values[is_last]
+    if len(own_ns) == 1:
+        return np.repeat(values, len(times_ns), axis=0)
+    at = Poses(own_ns, values[:, :3], unit(values[:, 3:])).at(np.clip(times_ns, own_ns[0], own_ns[-1]))
+    return np.hstack([at.position_m, at.quaternion])

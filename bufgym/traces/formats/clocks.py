@@ -6,18 +6,21 @@ and units", says what is refused and what is warned of.
 
 import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from bufgym.traces import plausible
 from bufgym.traces.formats.definitions import BagTopic, is_plain_cdr, typestore
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
+from bufgym.traces.sheet import Facts
 from bufgym.traces.trace import MAX_DURATION_S, Int64Array, first_true
 
 NS_PER_S: Final = 10**9
+DAY_S: Final = 86_400
 MAX_LOG_NS: Final = 2**63 - 1  # in the year 2262
 
 # Threads of a recorder may log two messages of one topic in either order; what is further apart is a step of the clock.
@@ -40,11 +43,7 @@ class LogTimes:
         """Topic -> its number, in order of their first messages."""
 
     def add(self, channel: BagTopic, logged_ns: int, data: bytes) -> None:
-        """Add a message.
-
-        Raises:
-            TraceError: its log time does not fit 63 bits.
-        """
+        """Add a message."""
         if not 0 <= logged_ns <= MAX_LOG_NS:
             place = f"message {len(self._time_ns) + 1} ({channel.topic})"
             raise fault(self.path, "must be from 0 to 2**63 - 1 ns", value=logged_ns, field=f"{place}, log time in ns")
@@ -65,11 +64,7 @@ class LogTimes:
         return np.array(self._topic, np.int64)
 
     def order(self) -> Int64Array:
-        """The messages in order of log time, int64[n].
-
-        Raises:
-            TraceError: a log time of 0 where no clock begins there, or too far from the others; a clock that went back.
-        """
+        """The messages in order of log time, int64[n]."""
         time_ns = self.time_ns
         self._check_range(time_ns)
         self._check_steps(time_ns)
@@ -83,6 +78,35 @@ class LogTimes:
                 f"{behind_ns[k] / NS_PER_S:.6g} s ({self._place(k)}): taken in order of log time",
             )
         return order
+
+    def stamps(self, needed: bool) -> tuple[Facts, Callable[[Int64Array], Int64Array]]:
+        """How header stamps went on and how late messages were, and the map from log times to the stamps' clock.
+
+        Both are by the topic with most stamps; a clock of stamps that is ``needed`` must be there.
+        """
+        stamped, topic = np.frombuffer(self._stamped, np.bool_), self.topic
+        counts = np.bincount(topic[stamped], minlength=1)
+        name = list(self.topics)[int(np.argmax(counts))] if counts.max() else ""
+        chosen = np.flatnonzero(stamped & (topic == int(np.argmax(counts))))
+        log_ns, behind_ns = self.time_ns[chosen], np.array(self._ahead_ns, np.int64)[chosen]
+        order = np.argsort(log_ns, kind="stable")
+        log_ns, stamp_ns = log_ns[order], np.maximum.accumulate((log_ns - behind_ns)[order])
+        if needed and (len(log_ns) < 2 or log_ns[0] == log_ns[-1]):
+            raise fault(self.path, "no topic has header stamps: clock (--clock) must be log")
+        rate = None if not len(log_ns) else plausible.stamp_rate(self.path, name, log_ns, stamp_ns, needed)
+
+        def on_stamps(time_ns: Int64Array) -> Int64Array:
+            at = np.interp(time_ns - log_ns[0], log_ns - log_ns[0], stamp_ns - stamp_ns[0])
+            slope = float(stamp_ns[-1] - stamp_ns[0]) / float(log_ns[-1] - log_ns[0])
+            outside = np.minimum(time_ns - log_ns[0], 0) + np.maximum(time_ns - log_ns[-1], 0)
+            since_ns: Int64Array = np.rint(at + slope * outside).astype(np.int64)
+            return np.asarray(since_ns + stamp_ns[0], np.int64)
+
+        if rate is None:
+            return (), on_stamps
+        delay_s = float(np.median(behind_ns)) / NS_PER_S
+        delay = f"delay {delay_s:.4g} s (median)" if abs(delay_s) < DAY_S else "of another clock"
+        return (("stamps", f"{rate:.4g} s in a second of log time, {delay}, {name}"),), on_stamps
 
     def _check_range(self, time_ns: Int64Array) -> None:
         zero = first_true(time_ns == 0)

@@ -12,14 +12,10 @@ _DDS_NAME: Final = re.compile(r"(\w+)::(\w+)::(?:dds_::)?(\w+?)_?")  # nav_msgs:
 _MOST_DEFINED: Final = 2**20  # Characters of a definition that is compared; a longer one is no definition of ROS
 # First two bytes of a message in a form of CDR; those of plain CDR are 0 and 1 (OMG, DDS-XTypes 1.3, table 60).
 _OTHER_FORMS: Final = {
-    2: "a parameter list of XCDR1",
-    3: "a parameter list of XCDR1",
-    6: "XCDR2",
-    7: "XCDR2",
-    8: "XCDR2, delimited",
-    9: "XCDR2, delimited",
-    10: "a parameter list of XCDR2",
-    11: "a parameter list of XCDR2",
+    **dict.fromkeys((2, 3), "a parameter list of XCDR1"),
+    **dict.fromkeys((6, 7), "XCDR2"),
+    **dict.fromkeys((8, 9), "XCDR2, delimited"),
+    **dict.fromkeys((10, 11), "a parameter list of XCDR2"),
 }
 
 

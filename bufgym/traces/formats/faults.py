@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from os import PathLike
 from typing import Final
 
@@ -26,7 +27,24 @@ def fault(
 
 def warn(path: StrPath, doubt: str, *, line: int | None = None) -> None:
     """Warn of what a file says that may be wrong, though it breaks no rule."""
-    warnings.warn(TraceWarning(where(path, line, None, doubt)), stacklevel=2)
+    warning = TraceWarning(where(path, line, None, doubt))
+    for doubts in _heard.get():
+        doubts.append(str(warning))
+    warnings.warn(warning, stacklevel=2)
+
+
+_heard: ContextVar[tuple[list[str], ...]] = ContextVar("_heard", default=())
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """Collect what ``warn`` says meanwhile, so that it stays with the recording."""
+    doubts: list[str] = []
+    token = _heard.set((*_heard.get(), doubts))
+    try:
+        yield doubts
+    finally:
+        _heard.reset(token)
 
 
 @contextmanager

@@ -2,25 +2,21 @@
 
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from bufgym.traces import plausible
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
 from bufgym.traces.formats.text import NUMBER, Line
-from bufgym.traces.formats.units import check_seconds
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array
 
 MAX_INTERVAL_BYTES: Final = 10**12
+MAX_MBIT_PER_S: Final = 10**6
 
 # A rate that would have to hold for longer is a gap in the recording, across which nothing is known.
 MAX_HOLD_S: Final = 86_400
-
-# A rate held for longer than this and for so many usual steps is a hole in the recording, of which we warn.
-HOLE_S: Final = 60
-HOLE_STEPS: Final = 3
-HOUR_S: Final = 3600  # Longer than usual by this much is a hole too: a clock was set to daylight-saving time
 
 
 class Knots(NamedTuple):
@@ -29,6 +25,8 @@ class Knots(NamedTuple):
     time_us: Int64Array  # int64[K], microseconds, from 0
     cumulative_bytes: Int64Array  # int64[K], bytes up to each time, from 0
     note: str = ""  # what the trace's `source` should say about the reading; empty for nothing
+    start_us: int = 0  # time 0 by the recording's clock, microseconds
+    ends: Sequence[tuple[int, str]] = ()  # line and time at each interval's end but the last's, where rates are held
 
 
 class Intervals:
@@ -85,6 +83,7 @@ class Rate(NamedTuple):
     time: str  # its time as it is written in the line
     start_us: int  # its time, microseconds
     bytes_per_us: float  # bytes a microsecond
+    unit: str = ""  # of its time, where a name or an option says it; else it must look like seconds
 
 
 def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
@@ -96,7 +95,7 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
     """
     intervals = Intervals()
     previous = again = None
-    steps: list[Rate] = []  # the rate at the end of each interval
+    ends: list[tuple[int, str]] = []
     starts_us, lines, total_bytes_per_us = array("q"), array("q"), 0.0
     for rate in rates:
         if previous is not None:
@@ -110,7 +109,7 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
                 again = rate
             else:
                 intervals.add(length_us, round(previous.bytes_per_us * length_us))
-                steps.append(rate)
+                ends.append((rate.line.number, rate.time))
         previous = rate
         starts_us.append(rate.start_us)
         lines.append(rate.line.number)
@@ -123,10 +122,10 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
             raise line.error(previous.time, f"must differ from the times above, {count} samples of one time", "time")
         raise line.error(line.text, "must have a second line: how long a single rate holds is unknown")
     length_us = round(float(np.median(np.asarray(intervals.us))))
-    if re.fullmatch(NUMBER, previous.time):
-        check_seconds(path, starts_us[0] / US_PER_S, length_us / US_PER_S)
+    if not previous.unit and re.fullmatch(NUMBER, previous.time):
+        plausible.check_seconds(path, np.asarray(starts_us) / US_PER_S)
     note = ""
-    if again is not None and length_us > HOLE_S * US_PER_S:
+    if again is not None and length_us > plausible.SLOW_S * US_PER_S:
         doubt = (
             f"{again.time} is the time of the line above, where {length_us / US_PER_S:g} s is usual: this one counts"
         )
@@ -136,20 +135,5 @@ def held_rates(path: StrPath, rates: Iterable[Rate]) -> Knots:
         left_out.add(np.asarray(starts_us, np.int64), np.asarray(lines, np.int64))
         mean = f": the mean of all lines is {total_bytes_per_us / len(starts_us) * 1000:,.6g} KB/s"
         note = left_out.said(path, "lines", effect=mean).removeprefix(", ")
-    _warn_of_holes(path, np.array(intervals.us, np.int64), length_us, steps)
     intervals.add(length_us, round(previous.bytes_per_us * length_us))
-    return intervals.knots(path, note)
-
-
-def _warn_of_holes(path: StrPath, lengths_us: Int64Array, usual_us: int, steps: list[Rate]) -> None:
-    """Warn of rates held much longer than usual; ``steps`` end the intervals."""
-    longer = (lengths_us > HOLE_STEPS * usual_us) | (lengths_us - usual_us >= HOUR_S * US_PER_S)
-    holes = np.flatnonzero((lengths_us > HOLE_S * US_PER_S) & longer)
-    if not len(holes):
-        return
-    longest = int(holes[np.argmax(lengths_us[holes])])
-    hole_s, usual_s = lengths_us[longest] / US_PER_S, usual_us / US_PER_S
-    count = f", the longest of {len(holes)} holes" if len(holes) > 1 else ""
-    line, time = steps[longest].line, steps[longest].time
-    doubt = f"{time} is {hole_s:.10g} s after the line above{count}, where {usual_s:g} s is usual: the rate is held"
-    warn(path, doubt, line=line.number)
+    return intervals.knots(path, note)._replace(start_us=starts_us[0], ends=ends)

@@ -26,22 +26,21 @@ MAX_BYTES: Final = 2**27
 
 
 def read_mahimahi(path: StrPath) -> Knots:
-    """Knots of the capacity.
-
-    Raises:
-        TraceError: a line that is not a whole number from 0 to 10**10, a time before that of the line above,
-            no line at all, none after ms 0 (such a trace would have no duration), or over MAX_BYTES.
-    """
+    """Knots of the capacity."""
     with open_text(path) as file:
         stamps_ms = _parsed_at_once(file.whole(MAX_BYTES))
     if stamps_ms is None:
         with open_text(path) as file:
             stamps_ms = _parsed_by_line(file)
+    if stamps_ms.size and stamps_ms[-1] == 0:
+        raise fault(path, "the last time must be after ms 0", value=0, field="time in ms")
+    return packets_at(path, np.maximum(stamps_ms, 1))
+
+
+def packets_at(path: StrPath, stamps_ms: Int64Array) -> Knots:
+    """The capacity of packets at these times, from ms 1 on."""
     if not stamps_ms.size:
         raise fault(path, "is empty: must hold a line for each packet")
-    if stamps_ms[-1] == 0:
-        raise fault(path, "the last time must be after ms 0", value=0, field="time in ms")
-    stamps_ms = np.maximum(stamps_ms, 1)
     is_last = np.append(stamps_ms[1:] != stamps_ms[:-1], True)
     return _knots(stamps_ms[is_last], np.flatnonzero(is_last) + 1)
 

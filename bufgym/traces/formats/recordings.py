@@ -3,20 +3,23 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from bufgym.traces import plausible
 from bufgym.traces.formats import bags
 from bufgym.traces.formats.clocks import NS_PER_S
-from bufgym.traces.formats.faults import StrPath, warn
+from bufgym.traces.formats.faults import StrPath, heard, warn
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.splits import is_recording
 from bufgym.traces.formats.workloads import read_workload_csv
 from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
+from bufgym.traces.sheet import Facts, Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.traces.workload import Workload
 from bufgym.utils.errors import BufgymError
@@ -26,34 +29,34 @@ _FEW: Final = 0.1  # Of all messages
 
 
 def read_workload(
-    path: StrPath,
+    path: StrPath | Sequence[StrPath],
     *,
     topics: Sequence[str] | None = None,
     odom: str | None = None,
     settings: MotionSettings | None = None,
     bridge_gaps: bool = False,
+    clock: str = "log",
     advance: Callable[[int], object] = int,
 ) -> Workload:
     """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
 
     Args:
-        path: the file or folder.
+        path: the file or folder; several recordings are read as one.
         topics: names, or patterns such as ``/camera/*``; by default all. They share one queue.
         odom: the topic whose motion gives x (recordings only; see `bags.read_bag`).
         settings: how motion is measured, by default `MotionSettings()`.
         bridge_gaps: take motion across a gap as the straight way from its first pose to its last (before the first
             pose and after the last: none); otherwise a gap is an error.
+        clock: the clock of a recording's arrivals (see `bags.read_bag`).
         advance: called with 1 for each message of a recording read, as a progress bar's update.
-
-    Raises:
-        TraceError: a file that cannot be read, or breaks a rule of its format.
-        BufgymError: an unknown topic, no message, or gaps without `bridge_gaps`.
     """
-    if not is_recording(path):
+    if not isinstance(path, str | PathLike) and len(path) == 1:
+        path = path[0]
+    if isinstance(path, str | PathLike) and not is_recording(path):
         if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
         return _with_topics(read_workload_csv(path), topics)
-    bag = bags.read_bag(path, odom, advance)
+    bag = bags.read_bag(path, odom, advance, clock)
     return workload_from_bag(bag, topics=topics, settings=settings, bridge_gaps=bridge_gaps)
 
 
@@ -71,9 +74,15 @@ def workload_from_bag(
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
     distant = _distant(time_ns, [names[number] for number in topic])
-    if distant and (bag.poses is None or bridge_gaps):
-        warn(bag.path, distant)
-    x, gaps = _motion_at(time_ns, bag, settings, bridge_gaps, distant)
+    with heard() as doubts:
+        if distant and (bag.poses is None or bridge_gaps):
+            warn(bag.path, distant)
+        elif not distant:
+            # Of all topics, as one alone may send now and then.
+            meanwhile = bag.time_ns[(bag.time_ns >= time_ns[0]) & (bag.time_ns <= time_ns[-1])]
+            plausible.warn_of_pauses(bag.path, (meanwhile - time_ns[0]) // 1000)
+        x, gaps, facts = _motion_at(time_ns, bag, settings, bridge_gaps, distant)
+    facts = (*time_facts("messages", (time_ns - time_ns[0]) // 1000, int(time_ns[0]) // 1000), *bag.sheet.facts, *facts)
     measured = ""
     if bag.poses is not None:
         view = f"{settings.fov_deg:g} degrees, {settings.scene_scale_m:g} m"
@@ -83,16 +92,19 @@ def workload_from_bag(
         others = ", ".join(name for name in bag.topics if name not in names)
         source += f"; {np.count_nonzero(~chosen):,} messages left out, on topics not chosen: {others}"
     name = trace_name(re.sub(r"(\.mcap|\.bag|\.db3)?(\.zstd)?$", "", bag.path))
-    return Workload(name, (time_ns - time_ns[0]) // 1000, bag.size_bytes[chosen], topic, names, x, source, gaps)
+    sheet = Sheet(facts, (*bag.sheet.doubts, *doubts))
+    return Workload(name, (time_ns - time_ns[0]) // 1000, bag.size_bytes[chosen], topic, names, x, source, gaps, sheet)
 
 
 def _motion_at(
     time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool, distant: str
-) -> tuple[Float64Array | None, tuple[tuple[int, int], ...]]:
-    """x of messages at these times, from 0, and the gaps in the poses between them; None without poses."""
+) -> tuple[Float64Array | None, tuple[tuple[int, int], ...], Facts]:
+    """x of messages at these times, from 0, the gaps in the poses between them, and facts; None without poses."""
     if bag.poses is None:
-        return None, ()
+        return None, (), ()
     motion = motion_from_poses(bag.poses, settings)
+    for doubt in motion.sheet.doubts:
+        warn(bag.path, doubt)
     time_us = (time_ns - bag.poses_from_ns) // 1000
     gaps = _gaps(time_us, bag.poses.time_us, settings.max_gap_s)
     if gaps and not bridge_gaps:
@@ -107,7 +119,7 @@ def _motion_at(
         )
     # Before the first pose and after the last no motion is known: np.interp holds its ends.
     x = np.interp(time_us, motion.time_us, motion.coordinate)
-    return x - x[0], gaps
+    return x - x[0], gaps, tuple(fact for fact in motion.sheet.facts if fact[0] not in ("start", "step"))
 
 
 def _distant(time_ns: Int64Array, topics: Sequence[str]) -> str:

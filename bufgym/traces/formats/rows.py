@@ -12,11 +12,12 @@ import numpy as np
 
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault, warn
 from bufgym.traces.formats.text import Line, TextFile, open_text
-from bufgym.traces.formats.units import LEAST_STEP_S, SLOW_STEP_S
+from bufgym.traces.formats.units import LEAST_STEP_S, SLOW_STEP_S, steady_step
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Float64Array, Int64Array
 
-RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]]]
-"""Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values."""
+RowReader = Callable[[Line, list[float] | None], tuple[str, int, list[float]] | None]
+"""Parses a line, given the values of the previous one, into the time as it is written, the time in us, and values; None
+for a line without a sample."""
 BlockReader = Callable[[bytes, list[float] | None], "tuple[Int64Array, Float64Array] | None"]
 """Parses lines of plain numbers into times in us, int64[m], and values, float64[m, columns]; None for other lines."""
 
@@ -29,6 +30,7 @@ class Rows(NamedTuple):
     time_us: Int64Array  # int64[n], microseconds from 0, increasing
     values: Float64Array  # float64[n, columns]
     note: str  # what was left out and is not worth a warning; empty for nothing
+    start_us: int  # time 0 by the recording's clock, microseconds
 
 
 def read_rows(
@@ -75,7 +77,9 @@ def _by_line(
     for line in file.block_lines(number, block):
         if line.number <= skip or line.text.startswith("#"):
             continue
-        text, time_us, row = read_row(line, previous)
+        if (sample := read_row(line, previous)) is None:
+            continue
+        text, time_us, row = sample
         check_order(line, "time in s", text, time_us, times)
         times.append(time_us)
         numbers.append(line.number)
@@ -134,13 +138,14 @@ class _Kept:
             raise fault(self._path, f"must hold at least 2 {what} of different times, has {len(self._times)}")
         time_us = np.frombuffer(self._times, np.int64)
         step_s = float(np.median(np.diff(time_us))) / US_PER_S
-        if step_s < LEAST_STEP_S:
+        if step_s < LEAST_STEP_S and steady_step(time_us) / US_PER_S < LEAST_STEP_S:
             rule = f"must be at least {LEAST_STEP_S:g} s (are the times in another unit?)"
             raise fault(self._path, rule, value=f"{step_s:g} s", field="median step of the times")
         if step_s > SLOW_STEP_S:
             warn(self._path, f"its {what} are {step_s:.6g} s apart (median): are the times in another unit?")
         note = left_out.said(self._path, what)
-        return Rows(time_us - time_us[0], np.frombuffer(self._values, np.float64).reshape(-1, self._columns), note)
+        values = np.frombuffer(self._values, np.float64).reshape(-1, self._columns)
+        return Rows(time_us - time_us[0], values, note, int(time_us[0]))
 
 
 def check_order(line: Line, field: str, text: str, time_us: int, times: Sequence[int]) -> None:

@@ -5,23 +5,36 @@ and no others. A folder without it, as a recorder leaves it that was killed, has
 order of time, which a warning says. Untrusted YAML can be nested so deep that its parser crashes, so its depth is
 measured first.
 
-What a file holds is told from its first bytes. One that zstd packed as a whole (``.zstd``) is read from an unpacked
-copy. A SQLite file with a journal beside it (``-wal``, ``-journal``) is read from a copy of both, because SQLite
-changes both when it reads them, and without the journal messages would be missing.
+What a file holds is told from its first bytes. One that was packed as a whole (``.zstd``, ``.gz``) is read from an
+unpacked copy. A SQLite file with a journal beside it (``-wal``, ``-journal``) is read from a copy of both, because
+SQLite changes both when it reads them, and without the journal messages would be missing.
 """
 
 import filecmp
 import shutil
 import tempfile
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Final
 
 from bufgym.traces.formats import bag_files
-from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals, unzstd, unzstd_pieces
+from bufgym.traces.formats.bag_files import SOURCES, Message, RefusedError, Unpacked, journals
 from bufgym.traces.formats.faults import StrPath, fault, os_errors, warn
+from bufgym.traces.formats.packed import (
+    ENDINGS,
+    HEAD_BYTES,
+    PACKINGS,
+    UNPACKERS,
+    packing,
+    pieces,
+    unzstd,
+    without_ending,
+)
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import read_utf8
 from bufgym.utils.libraries import library, missing
@@ -29,15 +42,16 @@ from bufgym.utils.libraries import library, missing
 MAX_METADATA_BYTES: Final = 2**23
 
 _RULE: Final = "must be an MCAP file, a ROS 1 bag, or a rosbag2 folder or .db3 file"
-_MAGICS: Final = {b"\x89MCAP0\r\n": "mcap", b"#ROSBAG V": "ros1", b"SQLite format 3\0": "rosbag2"}
-_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+_MAGICS: Final = {bag_files.MCAP_MAGIC: "mcap", b"#ROSBAG V": "ros1", b"SQLite format 3\0": "rosbag2"}
 _METADATA: Final = "metadata.yaml"
 _INFORMATION: Final = "rosbag2_bagfile_information"
-_ENDINGS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_ENDINGS: Final = tuple(f"{kind}{end}" for kind in (".mcap", ".db3", ".bag") for end in ("", *ENDINGS))
 _STORAGES: Final = {"sqlite3": "rosbag2", "mcap": "mcap"}
 _NONE: Final = ("", "none", "null", "~")  # of a compression, in small letters
 _MOST_NESTED: Final = 50  # ROS 2 writes six levels
 _LISTED_FILES: Final = 20  # A warning names no more
+_LISTED_SEAMS: Final = 3
+_SEAM_NS: Final = 10**9  # From the end of a file to the beginning of the next: a recorder that splits takes less
 _FIXES: Final = {
     "mcap": "`mcap recover {0} -o sound.mcap`",
     "ros1": "`rosbag reindex {0}`",
@@ -51,7 +65,7 @@ class Split:
 
     path: Path
     kind: str  # "mcap", "ros1", "rosbag2", or "" for anything else
-    packed: bool = False  # as a whole, in zstd
+    packed: str = ""  # as a whole: "zstd", "gzip", ...; empty if it is not
     by_message: bool = False  # each of its messages is packed in zstd, as the folder's metadata says
 
 
@@ -70,11 +84,14 @@ def refuse_recording(path: StrPath, rule: str) -> None:
         raise fault(path, f"is a recording of messages, whose topics `bufgym trace from-bag` lists: {rule}")
 
 
-def splits(path: Path) -> list[Split]:
-    """The files of a recording, all of one kind, in the order in which they are read.
-
-    Raises TraceError: no recording; a file that the metadata names is missing or of another kind.
-    """
+def splits(path: StrPath | Sequence[StrPath]) -> list[Split]:
+    """The files of a recording, or of several of one kind that are read as one, in the order of reading."""
+    if not isinstance(path, str | PathLike):
+        files = [split for one in path for split in splits(one)]
+        for split in files:
+            _check_kind(split, files[0])
+        return sorted(files, key=_begins_ns) if len(path) > 1 else files
+    path = Path(path)
     if not path.exists() or not is_recording(path):
         raise fault(path, _RULE if path.exists() else "no such file")
     if not path.is_dir():
@@ -84,10 +101,7 @@ def splits(path: Path) -> list[Split]:
 
 
 def split_messages(files: list[Split], types: dict[str, str]) -> Iterator[tuple[Path, Message]]:
-    """Every message of a recording's files, with the file that it is in; adds every topic to ``types``.
-
-    Raises TraceError: a file that is damaged, with how much of it is sound.
-    """
+    """Every message of a recording's files, with the file that it is in; adds every topic to ``types``."""
     with os_errors(files[0].path, "read"):
         unpacked = Unpacked(sum(split.path.stat().st_size for split in files))
     for split in files:
@@ -101,8 +115,9 @@ def _sound(split: Split, types: dict[str, str], unpacked: Unpacked) -> Generator
 
     def sound() -> str:
         first = f"its first {count:,} messages ({abs(last_ns - first_ns) / 1e9:.3f} s) are sound; " if count else ""
-        mend = _FIXES[split.kind].format(split.path.name.removesuffix(".zstd"))
-        return f"; {first}{mend} saves what is sound" + ", once `zstd -d` has unpacked it" * split.packed
+        mend = _FIXES[split.kind].format(without_ending(split.path.name))
+        unpack = f", once `{UNPACKERS[split.packed]}` has unpacked it" if split.packed else ""
+        return f"; {first}{mend} saves what is sound{unpack}"
 
     with damage_errors(split.path, after=sound):
         for message in _messages(split, types, unpacked):
@@ -112,12 +127,36 @@ def _sound(split: Split, types: dict[str, str], unpacked: Unpacked) -> Generator
             yield message
 
 
+class Seams:
+    """When the files of a recording begin and end."""
+
+    def __init__(self) -> None:
+        self._spans: list[tuple[Path, int, int]] = []  # file, first log time and last, ns
+
+    def add(self, file: Path, logged_ns: int) -> None:
+        """Add a message of this file; files come one after the other."""
+        _, first_ns, last_ns = self._spans.pop() if self._spans and self._spans[-1][0] == file else ("", logged_ns, 0)
+        self._spans.append((file, min(first_ns, logged_ns), max(last_ns, logged_ns)))
+
+    def said(self, path: StrPath) -> None:
+        """Warn of files between which there is a gap, and of those that overlap."""
+        apart = [
+            f"{two.name} begins {abs(first_ns - last_ns) / 1e9:.3f} s "
+            f"{'after' if first_ns > last_ns else 'before'} the end of {one.name}"
+            for (one, _, last_ns), (two, first_ns, _) in pairwise(self._spans)
+            if abs(first_ns - last_ns) > _SEAM_NS
+        ]
+        if apart:
+            more = f"; so do {len(apart) - _LISTED_SEAMS} more" if len(apart) > _LISTED_SEAMS else ""
+            warn(path, "; ".join(apart[:_LISTED_SEAMS]) + more)
+
+
 @contextmanager
 def damage_errors(path: Path, before: str = "", after: Callable[[], str] = str) -> Iterator[None]:
     """Turn whatever the libraries raise on a damaged file into one error that names the file."""
     try:
         yield
-    except BufgymError:
+    except (BufgymError, Warning):
         raise
     except ModuleNotFoundError as error:
         raise missing(f"{path}: reading recordings", error.name, "ros") from None
@@ -131,8 +170,9 @@ def damage_errors(path: Path, before: str = "", after: Callable[[], str] = str) 
 
 def _messages(split: Split, types: dict[str, str], unpacked: Unpacked) -> Iterator[Message]:
     with tempfile.TemporaryDirectory() as scratch:
-        for channel, logged_ns, data in SOURCES[split.kind](_readable(split, Path(scratch), unpacked), types):
-            is_packed = data.startswith(_ZSTD_MAGIC)
+        path, doubt = _readable(split, Path(scratch), unpacked), partial(warn, split.path)
+        for channel, logged_ns, data in SOURCES[split.kind](path, types, doubt):
+            is_packed = data.startswith(PACKINGS["zstd"])
             # CDR begins with a zero, so a message in it is told from a packed one without metadata.
             if channel.encoding == "cdr" and split.by_message and not is_packed and data[:1] != b"\0":
                 raise ValueError(f"a message on {channel.topic} that is neither CDR nor packed in zstd")
@@ -150,7 +190,7 @@ def _readable(split: Split, scratch: Path, unpacked: Unpacked) -> Path:
     copy = scratch / "copy"
     if split.packed:
         with split.path.open("rb") as file, copy.open("wb") as out:
-            for piece in unzstd_pieces(file):
+            for piece in pieces(file, split.packed):
                 unpacked.add(len(piece))
                 out.write(piece)
         return copy
@@ -168,12 +208,13 @@ def _split(path: Path) -> Split:
     if not path.is_file():
         raise fault(path, "must be a regular file")
     with path.open("rb") as file:
-        head = file.read(16)
-        packed = head.startswith(_ZSTD_MAGIC)
+        head = file.read(HEAD_BYTES)
+        packed = packing(head)
         if packed:
             file.seek(0)
-            with damage_errors(path):
-                head = next(unzstd_pieces(file), b"")
+            # Whoever reads another file as text says what is wrong with it.
+            with damage_errors(path), suppress(*() if path.name.endswith(_ENDINGS) else (EOFError,)):
+                head = next(pieces(file, packed), b"")
     return Split(path, next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), ""), packed)
 
 
@@ -205,7 +246,7 @@ def _listed(folder: Path) -> list[Split]:
 def _unlisted(folder: Path) -> list[Split]:
     """All files of the folder in order of time, each once."""
     files = sorted(path for path in folder.iterdir() if path.name.endswith(_ENDINGS) and path.name[0] != ".")
-    files = [path for path in files if path.suffix != ".zstd" or path.with_suffix("") not in files]
+    files = [path for path in files if path.suffix not in ENDINGS or path.with_suffix("") not in files]
     by_size: dict[int, list[Path]] = {}
     copies: list[str] = []
     for path in files:
@@ -216,15 +257,20 @@ def _unlisted(folder: Path) -> list[Split]:
             alike.append(path)
     found = [_split(path) for alike in by_size.values() for path in alike]
     for split in found:
-        if split.kind not in _STORAGES.values():
+        if not split.kind:
             raise fault(split.path, "holds no recording: must be fixed, or left out of the folder")
-        if split.kind != found[0].kind:
-            raise fault(split.path, f"must be a recording of the same storage as {found[0].path.name}")
+        _check_kind(split, found[0])
     found.sort(key=_begins_ns)
     names = ", ".join(split.path.name for split in found[:_LISTED_FILES]) + ", ..." * (len(found) > _LISTED_FILES)
     left_out = f", without copies of them ({', '.join(copies)})" if copies else ""
-    warn(folder, f"has no {_METADATA}, so its files are read in order of time: {names}{left_out}")
+    why = "" if found[0].kind == "ros1" else f"has no {_METADATA}, so "  # which ROS 1 does not write
+    warn(folder, f"{why}its files are read in order of time: {names}{left_out}")
     return found
+
+
+def _check_kind(split: Split, first: Split) -> None:
+    if split.kind != first.kind:
+        raise fault(split.path, f"must be a recording of the same storage as {first.path.name}")
 
 
 def _begins_ns(split: Split) -> int:

@@ -1,78 +1,137 @@
-"""Readers of simple tables: bufgym's CSV, the Belgium log, Mbit/s over time, rates over time."""
+"""Rates over time in tables: under a header that names them, in Mbit/s, or in columns that are chosen."""
 
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final, Literal
+from typing import Final
 
-from bufgym.traces.formats.faults import StrPath
-from bufgym.traces.formats.intervals import Intervals, Knots, Rate, held_rates
-from bufgym.traces.formats.text import Line, is_header, open_text, split_cells
+from bufgym.traces.formats.faults import StrPath, fault
+from bufgym.traces.formats.intervals import MAX_MBIT_PER_S, Knots, Rate, held_rates
+from bufgym.traces.formats.recipes import field_of, unit_named
+from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
+from bufgym.traces.formats.units import UNIT_S
 from bufgym.traces.trace import US_PER_S
+from bufgym.utils.errors import BufgymError
+from bufgym.utils.units import RATES
 
-CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 RATES_HEADER: Final = "time_s,bytes_per_s"
-MAX_MBIT_PER_S: Final = 10**6
-_TIME_COLUMNS: Final = ("time_s", "time", "timestamp", "date")
-_RATE_COLUMNS: Final = {"bytes_per_s": 1e-6, "mbps": 0.125, "mbit/s": 0.125, "kbps": 125e-6, "kbit/s": 125e-6}
-"""Name of a rate's column -> bytes per microsecond of its unit."""
+NAMED: Final = "--time COL --rate COL --unit kB/s (read_trace(columns=Columns(...)))"
+_RATE_NAMES: Final = {name.lower() for name in RATES}
 
-# 2286-11-20, the last epoch in ms with 13 digits.
-_MAX_EPOCH_MS: Final = 10**13
 _MAX_EPOCH_S: Final = 10**10
 
 
-def read_csv(path: StrPath) -> Knots:
-    """Header `t_ms,bytes,interval_ms`; times in ms with up to 3 decimals, so that microseconds survive."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.below_header(f"the header {CSV_HEADER}", lambda text: is_header(text, CSV_HEADER))[1]:
-            end_ms, count, length_ms = line.columns(3, ",")
-            intervals.add_ending_at(line, end_ms, length_ms, count)
-    return intervals.knots(path)
+@dataclass(frozen=True)
+class Columns:
+    """Which columns of a table hold what: each by its name in the header, or by its number from 1."""
 
-
-def read_belgium(path: StrPath) -> Knots:
-    """Raw log of the Ghent 4G measurements; position and epoch are checked, but not used."""
-    intervals = Intervals()
-    with open_text(path) as file:
-        for line in file.lines():
-            epoch, end_ms, latitude, longitude, count, length_ms = line.columns(6)
-            line.whole("epoch in ms", epoch, _MAX_EPOCH_MS)
-            line.decimal("latitude", latitude, -90, 90)
-            line.decimal("longitude", longitude, -180, 180)
-            intervals.add_ending_at(line, end_ms, length_ms, count)
-    return intervals.knots(path)
+    time: str
+    rate: str
+    unit: str = "bit/s"
+    """Of the rate: B/s, kB/s, Mbit/s, ..."""
+    time_unit: str = ""
+    """s, ms, us or ns; by default that in the time's name, else s."""
 
 
 def read_mbit(path: StrPath) -> Knots:
     """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
-    with open_text(path) as file:
-        return held_rates(path, (_rate(line, None, "Mbit/s", 0.125) for line in file.lines()))
+    return read_table(path, Columns("1", "2", "Mbit/s"))
 
 
 def fits_rates(text: str) -> bool:
-    """Whether a header names a time and a rate, as `time_s,bytes_per_s` and `time,mbps` do."""
-    time, *rate = split_cells(text.lower())
-    return time in _TIME_COLUMNS and len(rate) == 1 and rate[0] in _RATE_COLUMNS
+    """Whether a header names one time and one rate, as `time_s,bytes_per_s` and `time,mbps` do."""
+    return _columns_named(text) is not None
+
+
+def _columns_named(text: str) -> Columns | None:
+    names = split_cells(text)
+    times = [name for name in names if field_of(name) == "time"]
+    rates = [name for name in names if name.lower() in _RATE_NAMES]
+    return Columns(times[0], rates[0], rates[0]) if len(times) == len(rates) == 1 else None
 
 
 def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
-        header, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-        column = split_cells(header.lower())[1]
-        return held_rates(path, (_rate(line, ",", column, _RATE_COLUMNS[column]) for line in lines))
+        header, _ = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
+    columns = _columns_named(header)
+    assert columns is not None
+    return read_table(path, columns)
 
 
-def _rate(line: Line, separator: Literal[","] | None, field: str, unit: float) -> Rate:
+def read_table(path: StrPath, columns: Columns) -> Knots:
+    """A table whose columns are named, by the rules of `held_rates`; cells lie between commas, semicolons or blanks."""
+    if columns.unit not in RATES:
+        rule = "b is a bit and B a byte: must be as Mbps or MBps"
+        raise fault(path, rule, value=columns.unit, field="unit of the rate")
+    if columns.time_unit not in ("", *UNIT_S):
+        raise BufgymError(f"time_unit = {columns.time_unit!r}: must be one of {', '.join(UNIT_S)}")
+    with open_text(path) as file:
+        return held_rates(path, _table_rates(file.lines(), columns, RATES[columns.unit] / US_PER_S))
+
+
+def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
+    for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
+        # A column named time_s may hold anything.
+        named = columns.time_unit or unit_named(names[0]).removesuffix("s" if names[0] == "time_s" else "?")
+        yield _rate(line, time, rate, columns.unit, unit, named)
+
+
+def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
+    """Each line of a table with its cells in these columns, and the columns' names."""
+    places, names, count, separator = list[int](), list[str](), 0, ""
+    for line in lines:
+        if not count:
+            separator = separator_of(line.text)
+            header = cells_of(line.text.lstrip("#"), separator)
+            count = len(header)
+            places = [place_of(line, header, name) for name in wanted]
+            names = [header[k] for k in places]
+            if not all(re.fullmatch(NUMBER, header[k]) or date_us(header[k]) for k in places):
+                continue
+        if line.text.startswith("#"):
+            continue
+        cells = cells_of(line.text, separator)
+        if len(cells) != count:
+            raise line.misfit(f"must have {count} columns, has {len(cells)}")
+        yield line, [cells[k] for k in places], names
+
+
+def separator_of(text: str) -> str:
+    """What stands between the cells of a line; empty for blanks."""
+    return next((mark for mark in ";,\t" if mark in text), "")
+
+
+def cells_of(text: str, separator: str) -> list[str]:
+    """The cells of a line, without quotes; between semicolons, commas are decimal points."""
+    if separator == ";":
+        text = text.replace(",", ".")  # decimal commas
+    cells = [cell.strip().strip('"') for cell in text.split(separator or None)]
+    return cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells
+
+
+def place_of(line: Line, header: list[str], name: str) -> int:
+    """The place of a column that is numbered from 1, or named."""
+    if name.isdecimal() and 1 <= int(name[:6]) <= len(header):
+        return int(name) - 1
+    if name in header:
+        return header.index(name)
+    raise line.error(None, f"has no column {name!r}: must be one of {', '.join(header)[:300]}, or a number from 1")
+
+
+def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_unit: str = "") -> Rate:
     """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
-    time, rate = line.columns(2, separator)
-    start_us = _date_us(time) if separator else None
+    start_us = date_us(time)
     if start_us is None:
-        start_us = round(line.decimal("time in s", time, 0, _MAX_EPOCH_S) * US_PER_S)
-    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit)
+        unit_s = UNIT_S[time_unit or "s"]
+        start_us = round(
+            line.decimal(f"time in {time_unit or 's'}", time, 0, _MAX_EPOCH_S / unit_s) * unit_s * US_PER_S
+        )
+    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit, time_unit)
 
 
-def _date_us(text: str) -> int | None:
+def date_us(text: str) -> int | None:
     """Microseconds since 1970 of an ISO date, in UTC where it names no zone; None for other text."""
     try:
         date = datetime.fromisoformat(text if "-" in text else "")

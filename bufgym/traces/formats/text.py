@@ -1,24 +1,24 @@
-"""Text files, written completely or not at all, and read with bounds: plain or gzip'd.
+"""Text files, written completely or not at all, and read with bounds: plain or packed.
 
 Every reader gets its lines from here, so that a directory, a truncated download, a binary file or a compression bomb
 ends in the same clear `TraceError` whatever the format. The limits are 4 GiB of text after decompression, 2 * 10**7
 lines, 4096 characters a line, and for what is held as a whole 16 MiB of JSON and 128 MiB of Mahimahi's numbers.
 """
 
-import gzip
 import io
 import itertools
 import os
 import re
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from bufgym.traces.formats.faults import StrPath, fault, os_errors
+from bufgym.traces.formats.packed import HEAD_BYTES, Unpacking, archive, packing
 from bufgym.utils.errors import TraceError
 from bufgym.utils.files import replaced, unpacked_limit
+from bufgym.utils.libraries import missing
 
 # Text after decompression; reading stops as soon as there is more.
 MAX_TEXT_BYTES: Final = 4 * 2**30
@@ -28,13 +28,12 @@ MAX_JSON_BYTES: Final = 16 * 2**20
 
 _BLOCK_BYTES: Final = 2**22
 
-_GZIP_MAGIC = b"\x1f\x8b"
-_ZIP_MAGIC = b"PK\x03\x04"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 # int() and float() accept more than a data file should hold: "1_000", "infinity", digits of other scripts.
 _WHOLE = re.compile(r"[0-9]+")
 NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"  # Pattern of a plain finite decimal number
 _NUMBER = re.compile(NUMBER)
+_NO_JSON: Final = re.compile(rb"\s*\[ *(?:ID|SUM|[0-9]+)\] +\S")
 _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 
 
@@ -117,31 +116,47 @@ class Line(NamedTuple):
 
 @contextmanager
 def open_text(path: StrPath) -> Iterator["TextFile"]:
-    """Open a text file for one pass: plain or gzip, recognised by its first bytes whatever its name."""
+    """Open a text file for one pass: plain or packed, recognised by its first bytes whatever its name."""
     with os_errors(path, "opened"):
         raw = _open(path)
     with raw:
-        magic = raw.peek(4)[:4]
-        if magic == _ZIP_MAGIC:
-            raise fault(path, "is a zip archive: must be unpacked first")
-        stream: IO[bytes] = gzip.GzipFile(fileobj=raw) if magic.startswith(_GZIP_MAGIC) else raw  # type: ignore[assignment]
-        yield TextFile(path, stream, min(MAX_TEXT_BYTES, unpacked_limit(os.fstat(raw.fileno()).st_size)))
+        kind, most_bytes = packing(raw.peek(HEAD_BYTES)), unpacked_limit(os.fstat(raw.fileno()).st_size)
+        stream: io.BufferedReader[Any] = io.BufferedReader(Unpacking(raw, kind), _BLOCK_BYTES) if kind else raw
+        file = TextFile(path, stream, min(MAX_TEXT_BYTES, most_bytes), kind)
+        file.check_no_archive()
+        yield file
 
 
 class TextFile:
     """An open text file. Use one of `lines`, `first`, `text` and `whole`; all of them respect the module's limits."""
 
-    def __init__(self, path: StrPath, stream: IO[bytes], most_bytes: int = MAX_TEXT_BYTES) -> None:
+    def __init__(
+        self, path: StrPath, stream: "io.BufferedReader[Any]", most_bytes: int = MAX_TEXT_BYTES, packing: str = ""
+    ) -> None:
         """Take the file's name, for error messages, and its bytes after decompression, at most ``most_bytes``."""
-        self.path, self._stream, self._most_bytes = path, stream, most_bytes
+        self.path, self._stream, self._most_bytes, self._packing = path, stream, most_bytes, packing
         self._read_bytes = 0
 
-    def lines(self) -> Iterator[Line]:
-        """The lines that are not blank, numbered from 1, without surrounding white space.
+    def check_no_archive(self) -> None:
+        """Refuse a file that holds others, by its first bytes."""
+        with self._damage(1):
+            words = archive(str(self.path), self._stream.peek(HEAD_BYTES))
+        if words:
+            raise fault(self.path, words)
 
-        Raises:
-            TraceError: also for a line over MAX_LINE_CHARACTERS or not UTF-8, and more than MAX_LINES with blank ones.
-        """
+    @contextmanager
+    def _damage(self, line: int) -> Iterator[None]:
+        try:
+            yield
+        except EOFError as error:
+            raise fault(self.path, f"{self._packing} data damaged or cut off ({error})", line=line) from error
+        except ModuleNotFoundError as error:
+            raise missing(f"{self.path}: reading zstd", error.name, "ros") from None
+        except OSError as error:
+            raise fault(self.path, f"cannot be read: {error.strerror or error}", line=line) from error
+
+    def lines(self) -> Iterator[Line]:
+        """The lines that are not blank, numbered from 1, without surrounding white space."""
         for number, raw in self._raw_lines():
             line = _parsed_line(self.path, number, raw)
             if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
@@ -150,10 +165,7 @@ class TextFile:
                 yield line
 
     def blocks(self) -> Iterator[tuple[int, bytes]]:
-        """All lines in blocks of some MB, each with the number of its first line; see `block_lines`.
-
-        Raises TraceError as `lines`, a block at a time.
-        """
+        """All lines in blocks of some MB, each with the number of its first line; see `block_lines`."""
         number, rest = 1, b""
         while data := self._take(_BLOCK_BYTES, number, whole_line=False):
             cut = data.rfind(b"\n") + 1
@@ -192,11 +204,11 @@ class TextFile:
     def first(self) -> Line | None:
         """The first line that is not blank, None in an empty file.
 
-        JSON may be a single line of any length, so only its opening bracket is returned.
+        JSON may be a single line of any length, so only its opening bracket is returned; iperf's text begins with one.
         """
         for number, raw in self._raw_lines():
             bracket = raw.lstrip()[:1]
-            if bracket in (b"[", b"{"):
+            if bracket in (b"[", b"{") and not _NO_JSON.match(raw):
                 return Line(self.path, number, bracket.decode())
             line = _parsed_line(self.path, number, raw)
             if line.text:
@@ -231,12 +243,8 @@ class TextFile:
             yield number, raw
 
     def _take(self, count: int, line: int, whole_line: bool) -> bytes:
-        try:
+        with self._damage(line):
             data = self._stream.readline(count) if whole_line else self._stream.read(count)
-        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-            raise fault(self.path, f"gzip data damaged or cut off ({error})", line=line) from error
-        except OSError as error:
-            raise fault(self.path, f"cannot be read: {error.strerror or error}", line=line) from error
         is_start = self._read_bytes == 0
         self._read_bytes += len(data)
         if self._read_bytes > self._most_bytes:

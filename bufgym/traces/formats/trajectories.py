@@ -14,21 +14,25 @@ on the order of a quaternion's four.
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
-from bufgym.traces.formats.leaps import warn_of_leaps
 from bufgym.traces.formats.rows import BlockReader, RowReader, read_rows
+from bufgym.traces.formats.tables import cells_of, date_us
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
+from bufgym.traces.plausible import check_slow_poses, warn_of_jumps
 from bufgym.traces.poses import Poses, normalize, quaternions
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
-from bufgym.utils.errors import BufgymError
+from bufgym.utils.errors import BufgymError, TraceError
+
+if TYPE_CHECKING:
+    from bufgym.traces.formats.pose_tables import PoseColumns
 
 POSE_FORMATS: Final = ("tum", "euroc", "kitti")
 
@@ -39,7 +43,12 @@ MAX_EPOCH_S: Final = 1e11
 _EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
 # State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
 _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
-_NAMES: Final = {"tum": ("tx", "ty", "tz", "qx", "qy", "qz", "qw"), "euroc": ("px", "py", "pz", "qw", "qx", "qy", "qz")}
+MOST: Final = {"latitude": 90.0, "longitude": 180.0, "altitude": 1e5}
+NO_TURN: Final = [0.0, 0.0, 0.0, 1.0]
+_NAMES: Final = {
+    "tum": ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    "euroc": ("time", "px", "py", "pz", "qw", "qx", "qy", "qz"),
+}
 _OWN_UNIT: Final = {"tum": "s", "euroc": "ns"}
 _TIMES_READ: Final = 1000  # Lines by which the unit is found
 _SURE_NORM: Final = NORM_TOLERANCE - 1e-9  # Whatever the rounding of the norm
@@ -47,7 +56,12 @@ PLAIN: Final = b"0123456789+-.eE, \t\r\n"  # A block of other bytes is read line
 
 
 def read_poses(
-    path: StrPath, *, format: str | None = None, times: StrPath | None = None, advance: Callable[[int], object] = int
+    path: StrPath,
+    *,
+    format: str | None = None,
+    times: StrPath | None = None,
+    columns: "PoseColumns | None" = None,
+    advance: Callable[[int], object] = int,
 ) -> Poses:
     """Read a trajectory, plain or gzip'd; the first time becomes 0.
 
@@ -55,17 +69,22 @@ def read_poses(
         path: the file.
         format: one of `POSE_FORMATS`, with times in its own unit; by default both are found (see above).
         times: KITTI's file of times; by default the file of the same name with ``_times`` beside it.
+        columns: of any other table, which columns hold what; without `format` and `times`.
         advance: called with the number of lines just read, as a progress bar's update.
-
-    Raises:
-        TraceError: the file cannot be read, or a line breaks a rule: as many finite numbers as the format has,
-            positions within 10**7 m, a quaternion of unit norm (a rotation matrix) within 1 %, times that never
-            decrease and span at most 10**7 s, at least two lines, most poses 0.1 ms apart or more.
-        BufgymError: an unknown format, or `times` with another format than KITTI's.
     """
-    unit = _OWN_UNIT.get(format or "", "s")
+    from bufgym.traces.formats.pose_tables import read_pose_table
+
+    if columns is not None and (format is not None or times is not None):
+        raise BufgymError("columns of a table go without format and times")
+    if format is None and times is None and (table := read_pose_table(path, columns, advance)) is not None:
+        rows, about = table
+        normalize(rows.values[:, 3:])
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{about}{rows.note}", rows.start_us)
+        warn_of_jumps(path, poses)
+        return poses
+    unit, named = _OWN_UNIT.get(format or "", "s"), format is not None
     if format is None:
-        format, unit = _detected(path)
+        format, unit = _detected(path, (8, 11, 12, 17))
     if format not in POSE_FORMATS:
         raise BufgymError(f"format = {format!r}: must be one of {', '.join(POSE_FORMATS)}")
     if format == "kitti":
@@ -73,18 +92,19 @@ def read_poses(
     elif times is not None:
         raise BufgymError(f"times = {str(times)!r}: goes with KITTI matrices only, and {path} is in format {format}")
     else:
-        rows = read_rows(
-            path, _pose_row(format, unit), read_block=_pose_block(format, unit), what="poses", advance=advance
-        )
+        row = pose_row({name: k for k, name in enumerate(_NAMES[format])}, _COLUMNS[format], unit)
+        rows = read_rows(path, row, read_block=_pose_block(format, unit), what="poses", advance=advance)
         note = "" if unit == _OWN_UNIT[format] else f", times in {unit}"
         normalize(rows.values[:, 3:])
-        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}")
-    warn_of_leaps(path, poses)
+        poses = Poses(rows.time_us, rows.values[:, :3], rows.values[:, 3:], f"{format}{note}{rows.note}", rows.start_us)
+    if unit == "s" and format == "tum" and not named:
+        check_slow_poses(path, poses)
+    warn_of_jumps(path, poses)
     return poses
 
 
-def _detected(path: StrPath) -> tuple[str, str]:
-    """The format and the unit of the times that the file's first lines fit."""
+def _detected(path: StrPath, counts: tuple[int, ...]) -> tuple[str, str]:
+    """The format and the unit of the times that the file's first lines fit; they have so many columns."""
     times: list[float] = []
     columns, blanks, named, decimals = 0, False, None, 0
     with open_text(path) as file:
@@ -95,7 +115,9 @@ def _detected(path: StrPath) -> tuple[str, str]:
             cells = _cells(line)
             if not columns:
                 columns, blanks = len(cells), "," not in line.text
-            if (columns == 12 and blanks) or len(times) == _TIMES_READ or not re.fullmatch(NUMBER, cells[0]):
+                if columns not in counts:
+                    raise _miscounted(line, columns, _COLUMNS["euroc"])
+            if (columns == 12 and blanks) or len(times) == _TIMES_READ or not is_number(cells[0]):
                 break
             times.append(float(cells[0]))
             decimals = max(decimals, len(cells[0].partition(".")[2]))
@@ -117,22 +139,42 @@ def seconds(line: Line, text: str) -> int:
     return round(line.decimal("time in s", text, 0, MAX_EPOCH_S) * US_PER_S)
 
 
-def _pose_row(format: str, unit: str) -> RowReader:
-    """The reader of a line of TUM or EuRoC with times in this unit."""
-    columns, names = _COLUMNS[format], _NAMES[format]
-    more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
+def pose_row(places: dict[str, int], columns: Sequence[int], unit: str, separator: str | None = None) -> RowReader:
+    """The reader of a line of so many columns that has a time in this unit, x, y[, z][, a quaternion] in these places.
+
+    Without ``separator``, cells are separated by commas if the line has any, else by blanks, and times are numbers.
+    """
+    fields = [field for field in places if field != "time"]
+    turn = fields[3:]
+    place = fields[: 3 if turn or len(fields) == 3 else 2]
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
-        cells = _cells(line)
+        cells = _cells(line) if separator is None else cells_of(line.text, separator)
         if len(cells) not in columns:
-            raise line.misfit(f"must have 8 columns{more}, has {len(cells)}")
-        return cells[0], _time_us(line, cells[0], unit), _pose(line, cells[1:8], names)
+            raise _miscounted(line, len(cells), columns)
+        text, values = cells[places["time"]], list[float]()
+        date = None if separator is None else date_us(text)
+        for field in place:
+            most = MOST.get(field, MAX_POSITION_M)
+            values.append(line.decimal(field, cells[places[field]], -most, most))
+        values += [0.0] * (3 - len(values))
+        quaternion = [line.decimal(field, cells[places[field]], -MAX_POSITION_M, MAX_POSITION_M) for field in turn]
+        norm = math.hypot(*quaternion) if turn else 1
+        if abs(norm - 1) > NORM_TOLERANCE:
+            raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
+        return text, time_in_us(line, text, unit) if date is None else date, [*values, *(quaternion or NO_TURN)]
 
     return row
 
 
+def _miscounted(line: Line, has: int, columns: Sequence[int]) -> TraceError:
+    more = f" (or {' or '.join(map(str, columns[1:]))} of a state estimate)" if columns[1:] else ""
+    rule = f"must have {columns[0]} columns{more}, has {has}: name them with --time COL --pose X Y Z QX QY QZ QW"
+    return line.misfit(rule)
+
+
 def _pose_block(format: str, unit: str) -> BlockReader:
-    """The reader of a block of such lines, as `_pose_row` reads each."""
+    """The reader of a block of such lines, as `pose_row` reads each."""
     time_type, most = ("f8", MAX_EPOCH_S) if unit == "s" else ("i8", MAX_EPOCH_S / UNIT_S[unit])
     ticks = round(1 / (UNIT_S[unit] * US_PER_S))  # in a microsecond; 0 where the unit is longer
 
@@ -162,7 +204,12 @@ def _pose_block(format: str, unit: str) -> BlockReader:
     return block
 
 
-def _time_us(line: Line, text: str, unit: str) -> int:
+def is_number(text: str) -> bool:
+    """Whether a cell is a plain number."""
+    return re.fullmatch(NUMBER, text) is not None
+
+
+def time_in_us(line: Line, text: str, unit: str) -> int:
     """A time in this unit, as microseconds."""
     if unit == "s":
         return seconds(line, text)
@@ -176,20 +223,9 @@ def _cells(line: Line) -> list[str]:
     return split_cells(line.text) if "," in line.text else line.text.split()
 
 
-def _pose(line: Line, cells: list[str], names: tuple[str, ...]) -> list[float]:
-    """Position and quaternion."""
-    values = [
-        line.decimal(name, text, -MAX_POSITION_M, MAX_POSITION_M) for name, text in zip(names, cells, strict=True)
-    ]
-    norm = math.hypot(*values[3:])
-    if abs(norm - 1) > NORM_TOLERANCE:
-        raise line.error(f"{norm:.6g}", "must be 1 within 1 %", "norm of the quaternion")
-    return values
-
-
 def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callable[[int], object]) -> Poses:
     times = _times_beside(path) if times is None else times
-    stamps = _read_times(times, unit or _detected(times)[1])
+    stamps = _read_times(times, unit or _detected(times, (1,))[1])
 
     def row(line: Line, previous: list[float] | None) -> tuple[str, int, list[float]]:
         cells = line.columns(12)
@@ -207,14 +243,14 @@ def _read_kitti(path: StrPath, times: StrPath | None, unit: str, advance: Callab
         raise fault(times, f"holds more times than {path} has poses")
     matrices = rows.values.reshape(-1, 3, 4)
     format = f"kitti, times from {Path(times).name}{rows.note}"
-    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format)
+    return Poses(rows.time_us, matrices[:, :, 3], quaternions(matrices[:, :, :3]), format, rows.start_us)
 
 
 def _read_times(path: StrPath, unit: str) -> Iterator[tuple[str, int]]:
     with open_text(path) as file:
         for line in file.lines():
             (text,) = line.columns(1)
-            yield text, _time_us(line, text, unit)
+            yield text, time_in_us(line, text, unit)
 
 
 def _times_beside(path: StrPath) -> Path:

@@ -9,24 +9,22 @@ from typing import Final
 import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault, warn
-from bufgym.traces.trace import Float64Array
+from bufgym.traces.plausible import DATES_S
+from bufgym.traces.trace import Float64Array, Int64Array
 
 UNIT_S: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LEAST_STEP_S: Final = 1e-4  # No camera or robot tells its pose more often
 SLOW_STEP_S: Final = 10.0  # Nor most of the time less often than this
 
-_DATES_S: Final = (9.4e8, 2.84e9)  # Seconds since 1970 from 2000 until 2059
 _LONGEST_UPTIME_S: Final = 3.2e7  # A year
 _USUAL_STEPS_S: Final = (0.9e-3, SLOW_STEP_S)  # From one pose to the next, where only the steps tell the unit
 _LONGEST_STEP_S: Final = 3600  # The same where the times count from 1970
 _GAP_S: Final = 1.05  # From one pose to the next, with some jitter: longer ones are gaps
 _SHARED: Final = 0.1  # Where more samples share a time, the mean step counts
+_TOGETHER: Final = 10  # Samples of a burst, at most
+_BURST: Final = 20  # Times the median step that samples in bursts are apart on average
 _DECIMALS: Final = 4  # Clocks that count in ms have fewer
 _FRAMES: Final = 10  # Poses from which on whole numbers in a row look like frame numbers
-_LEAST_SAMPLE_S: Final = 1e-3  # No tool measures a link more often
-_SERIAL_DAYS: Final = (36_526, 58_074)  # Days since 1899-12-30, as spreadsheets count, from 2000 until 2058
-_FEW_S: Final = 50  # Steps of ms look like these seconds; of seconds, these are usual:
-_USUAL_S: Final = (60, 120, 180, 240, 300, 600, 900, 1200, 1800)
 _SAY: Final = "say format='tum' or 'kitti' (s) or 'euroc' (ns), or put '#timestamp [{0}]' above the first line"
 
 
@@ -81,11 +79,12 @@ def warn_of_unit(path: StrPath, times: Float64Array, unit: str, named: bool) -> 
         text = f"{times[0]:.0f}, {times[1]:.0f}, {times[2]:.0f}"
         warn(path, f"times {text}, ... look like frame numbers: they are taken as seconds, one pose in each")
     fits = [one for one in UNIT_S if _is_dated(times[0], step, one) or _is_running(times[0], step, one)]
-    if named and unit not in fits and len(fits) == 1 and step * UNIT_S[unit] >= LEAST_STEP_S:
-        doubt = (
-            f"makes {step * UNIT_S[unit]:.4g} s from pose to pose, where {fits[0]} make {step * UNIT_S[fits[0]]:.4g} s"
-        )
-        warn(path, f"its header says that times are in {unit}, which {doubt}")
+    if named and unit not in fits and len(fits) == 1:
+        makes = f"{step * UNIT_S[unit]:.4g} s from pose to pose, where {fits[0]} make {step * UNIT_S[fits[0]]:.4g} s"
+        doubt = f"its header says that times are in {unit}, which makes {makes}"
+        if step * UNIT_S[unit] < LEAST_STEP_S:
+            raise fault(path, f"{doubt}: must say [{fits[0]}]")
+        warn(path, doubt)
 
 
 def _step(times: Float64Array) -> float | None:
@@ -95,40 +94,25 @@ def _step(times: Float64Array) -> float | None:
     above = steps[(steps > 0) & np.isfinite(steps)]
     if not len(above):
         return None
+    if len(times) > 2 * _TOGETHER and (of_bursts := steady_step(times)) > _BURST * np.median(above):
+        return of_bursts
     share = len(above) / len(steps)
     return float(np.median(above)) * (share if share < 1 - _SHARED else 1)
+
+
+def steady_step(times: Float64Array | Int64Array) -> float:
+    """Median step over several samples together, so that samples in bursts count by the time between bursts."""
+    count = min(_TOGETHER, len(times) - 1)
+    return float(np.median(times[count:] - times[:-count])) / count
 
 
 def _is_dated(first: float, step: float, unit: str) -> bool:
     """Whether a first time is a date in this unit, and poses follow each other within an hour."""
     unit_s = UNIT_S[unit]
-    return _DATES_S[0] <= first * unit_s < _DATES_S[1] and LEAST_STEP_S <= step * unit_s <= _LONGEST_STEP_S
+    return DATES_S[0] <= first * unit_s < DATES_S[1] and LEAST_STEP_S <= step * unit_s <= _LONGEST_STEP_S
 
 
 def _is_running(first: float, step: float, unit: str) -> bool:
     """Whether a first time is at most a year after a start in this unit, and poses follow each other as usual."""
     unit_s = UNIT_S[unit]
     return first * unit_s <= _LONGEST_UPTIME_S and _USUAL_STEPS_S[0] <= step * unit_s <= _USUAL_STEPS_S[1]
-
-
-def check_seconds(path: StrPath, first_s: float, step_s: float) -> None:
-    """Check that the times of a link, given as numbers, can be seconds: the first, and the median step.
-
-    Refuses days, as spreadsheets write dates, and steps that no tool has; warns of steps that are usual in ms.
-    """
-    day_s = step_s * 86_400
-    is_day = _SERIAL_DAYS[0] <= first_s < _SERIAL_DAYS[1] and step_s < 0.5
-    if is_day and (step_s < _LEAST_SAMPLE_S or (_is_whole(day_s) and not _is_whole(step_s * 1000))):
-        rule = "looks like days, as a spreadsheet writes dates: must be in s, or a date as 2024-01-31 12:00:00"
-        raise fault(path, rule, value=f"{first_s:.10g}", field="time in s")
-    if step_s < _LEAST_SAMPLE_S:
-        rule = f"must be at least {_LEAST_SAMPLE_S:g} s (are the times in another unit?)"
-        raise fault(path, rule, value=f"{step_s:.3g} s", field="median step of the times")
-    is_usual = any(abs(step_s / usual - 1) < 0.01 for usual in _USUAL_S) or _is_whole(step_s / 3600)
-    if step_s >= _FEW_S and not is_usual and not _DATES_S[0] <= first_s < _DATES_S[1]:
-        warn(path, f"its times are {step_s:.6g} s apart (median): are they in ms? they are taken as seconds")
-
-
-def _is_whole(value: float) -> bool:
-    """Whether a number is about a whole number above 0: days in whole microseconds of a day are off by 0.04 s."""
-    return round(value) > 0 and abs(value - round(value)) < 0.05

@@ -11,20 +11,16 @@ import numpy as np
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_INTERVAL_BYTES
 from bufgym.traces.formats.mahimahi import PACKET_BYTES
-from bufgym.traces.formats.tables import CSV_HEADER
 from bufgym.traces.formats.text import decimals, write_text
 from bufgym.traces.trace import MAX_DURATION_S, US_PER_S, Int64Array, Trace
 
+CSV_HEADER: Final = "t_ms,bytes,interval_ms"
 # Lines of at most 11 digits, as many as fit into the reader's 128 MiB.
 MAX_PACKETS: Final = 10**7
 
 
 def write_csv(trace: Trace, path: StrPath) -> None:
-    """Write the `csv` format, one line a segment; `read_trace` gives back the same knots, exactly.
-
-    Raises:
-        TraceError: cannot be written, or beyond what the reader accepts (10**12 bytes in a segment, 10**7 s).
-    """
+    """Write the `csv` format, one line a segment; `read_trace` gives back the same knots, exactly."""
     segment_bytes = np.diff(trace.cumulative_bytes)
     if segment_bytes.max() > MAX_INTERVAL_BYTES or trace.duration_us > MAX_DURATION_S * US_PER_S:
         rule = f"a segment must hold at most {MAX_INTERVAL_BYTES} bytes, the trace {MAX_DURATION_S} s"
@@ -43,9 +39,6 @@ def write_mahimahi(trace: Trace, path: StrPath) -> None:
     So no packet is ahead of the trace, and none is late by more than the rest of its ms. The last line says how
     long the trace lasts, so there is a packet at the end (the next whole ms) even if not all its bytes are through by
     then. A trace that came from Mahimahi is preserved exactly (its packets of ms 0 as packets of ms 1).
-
-    Raises:
-        TraceError: cannot be written, or beyond what the reader accepts (10**7 s, 10**7 packets).
     """
     packets = trace.total_bytes // PACKET_BYTES
     if packets > MAX_PACKETS or trace.duration_us > MAX_DURATION_S * US_PER_S:

@@ -23,7 +23,7 @@ from bufgym_live.relay.config import Limits
 from bufgym_live.relay.hub import Hub
 from bufgym_live.relay.rules import Identity, Permissions, plain_address
 from bufgym_live.relay.wire import RefusedError
-from bufgym_live.robot.sockets import DEAD_AFTER_S, little_unsent, set_option
+from bufgym_live.robot.sockets import BACKOFF_S, DEAD_AFTER_S, bounded_backoff, little_unsent, set_option
 
 POLICY_VIOLATION: Final = 1008
 _OTHER_METHODS: Final = frozenset(b"HEAD POST PUT DELETE CONNECT OPTIONS TRACE PATCH".split())
@@ -167,6 +167,7 @@ class Accepted(ServerConnection):
         tcp = transport.get_extra_info("socket")
         with contextlib.suppress(OSError):
             set_option(tcp, "TCP_USER_TIMEOUT", round(DEAD_AFTER_S * 1000))
+            bounded_backoff(tcp, BACKOFF_S)  # so a stop is there a second after a dead link's return
             if self._admission.hub.config.small_buffers:
                 little_unsent(tcp)
 

@@ -4,8 +4,7 @@ from typing import Final
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.hub import Hub
-from bufgym_live.relay.store import NOT_REACHED
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import UNKNOWN, Settled, StoredSession
 
 _GRACE_US: Final = 2_000_000  # time beyond a command's deadline for the answer to come
 
@@ -29,7 +28,7 @@ class Answers:
             self._hub.settled(Settled(sender, seq, 1, lost, why))
 
     def tick(self) -> None:
-        """Give up what is not answered by now: no relay has the robot."""
+        """Give up what is not answered by now: no relay has the robot, or its answer was lost on the way."""
         now_us = self._hub.now_us()
         for number in [one for one, (_, _, until_us) in self._awaited.items() if until_us + _GRACE_US < now_us]:
-            self.came(number, 1, NOT_REACHED)
+            self.came(number, 1, f"no other relay says that its robot was reached: {UNKNOWN}")

@@ -1,12 +1,14 @@
 """Which session is which robot: a robot's connection claims its name, and commands wait for that session alone."""
 
 import json
+import math
 from collections.abc import Callable
 from typing import Final
 
 from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.store import Store
 from bufgym_live.relay.stored import StoredSession
 from bufgym_live.relay.wire import RefusedError
 
@@ -29,13 +31,17 @@ class Claims:
 
     def __init__(
         self,
+        store: Store,
         audit: Audit,
         publish: Callable[[wire.Message], None],
         clock: Callable[[], float],
         now_us: Callable[[], int],
     ) -> None:
+        self._store = store
         self._audit, self._publish, self._clock, self._now_us = audit, publish, clock, now_us
-        self._sessions: dict[str, StoredSession] = {}
+        self.told: Callable[[str, str], None] = lambda robot, address: None
+        """Called with each robot that is here anew, and its address, for other relays."""
+        self._sessions = {session.robot: session for session in store.sessions.values() if session.robot}
 
     def get(self, robot: str) -> StoredSession | None:
         """The session that is this robot, here or away; None if nobody has claimed it."""
@@ -52,7 +58,7 @@ class Claims:
         other = self._sessions.get(robot)
         if other is None or other.key == (identity.key, session):
             return None
-        here = other.away_s == float("inf")
+        here = other.away_s == math.inf
         if here and self._clock() - other.heard_s < SILENT_S:
             why = f"another robot of this name is here, at {other.identity.address}"
             self._warn(robot, f"two robots have this name: the one at {identity.address} was refused", identity)
@@ -66,9 +72,16 @@ class Claims:
         """Note that a session is this robot."""
         self._sessions.pop(robot, None)
         self._sessions[robot] = session
-        session.robot, session.kept = robot, True
+        self._store.claimed(session, robot)
+        self.told(robot, session.identity.address)
         if len(self._sessions) > _MOST:
             del self._sessions[next(iter(self._sessions))]
+
+    def elsewhere(self, robot: str, relay: str, address: str) -> None:
+        """Warn if a robot that another relay has is here, too."""
+        session = self._sessions.get(robot)
+        if session is not None and session.away_s == math.inf and self._clock() - session.heard_s < SILENT_S:
+            self._warn(robot, f"two robots have this name: one at {address}, at relay {relay}", session.identity)
 
     def _warn(self, robot: str, why: str, identity: Identity) -> None:
         self._audit.repeated(what="robot", code="taken", why=f"{robot}: {why}", **identity.as_json())

@@ -187,7 +187,7 @@ class RobotClient(Session):
                 self._away.remove(away)
                 away.leave()
                 return
-            if any(pattern.fullmatch(message.topic) for pattern in self._no_drop):
+            if any(pattern.whole(message.topic) for pattern in self._no_drop):
                 away.held = self._unanswered.put(message._replace(no_drop=True))
                 self._wanted.set()
             else:

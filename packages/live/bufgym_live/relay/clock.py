@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 ASK_S: Final = 2.0  # Time between two questions of a client
+_MINUTE_S: Final = 60.0
 _DRIFT: Final = 5e-4  # most that two clocks drift apart, s for each s
 
 
@@ -59,3 +60,17 @@ class RelayClock:
         """Whether this time of the relay's may be over."""
         now_s = self.clock()
         return now_s + self._high_s + _DRIFT * (now_s - self._set_s) > relay_us / 1e6
+
+
+class Delays:
+    """Delays of another relay's messages beyond the least of the last minutes. Two clocks never agree."""
+
+    def __init__(self) -> None:
+        self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf
+
+    def extra_s(self, delay_s: float, now_s: float) -> float:
+        """Take a message's delay by two clocks; give what exceeds the usual."""
+        if now_s - self._since_s > _MINUTE_S:
+            self._since_s, self._before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, delay_s)
+        return delay_s - min(self._before_s, self._least_s)

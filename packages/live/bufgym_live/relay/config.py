@@ -56,6 +56,8 @@ class Rule(Section, frozen=True, kw_only=True):
     topic: str = ".*"
     command_s: Seconds = COMMAND_S
     """Time after which a robot does not execute a command sent under this rule; its sender may say less."""
+    speed: Annotated[float, Meta(gt=0, le=100)] = 3.0
+    """Largest velocity that is sent on to a robot under this rule, m/s and rad/s."""
 
     def __post_init__(self) -> None:
         if sum(map(bool, (self.address, self.email, self.recorder, self.foxglove, self.nats))) != 1:

@@ -1,7 +1,6 @@
 """One client's connection in its session: its checked requests. Its ``outbox`` sends to it."""
 
 import asyncio
-import hashlib
 import itertools
 import secrets
 import time
@@ -16,6 +15,7 @@ from bufgym_live.relay import outbox, policies, protocol, replay, wire
 from bufgym_live.relay.admission import POLICY_VIOLATION
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.config import Rule
+from bufgym_live.relay.drive import check_speed
 from bufgym_live.relay.orders import is_stop, order, robot_of
 from bufgym_live.relay.outbox import Outbox
 from bufgym_live.relay.outgoing import Outgoing
@@ -25,7 +25,7 @@ from bufgym_live.relay.quota import Quota
 from bufgym_live.relay.recorder import FOLDER as RECORDINGS
 from bufgym_live.relay.roster import is_last
 from bufgym_live.relay.rules import Permissions
-from bufgym_live.relay.stored import StoredSession
+from bufgym_live.relay.stored import UNKNOWN, StoredSession, command_number
 from bufgym_live.relay.subscriber import Subscription
 from bufgym_live.relay.wire import RefusedError
 
@@ -103,7 +103,7 @@ class Connection:
             if (known := self.session.outcomes.get(seq)) is not None:
                 self._hub.tell_outcome(known)
             elif seq <= self.session.received and not await self._hub.store.waits(self.session, seq):
-                self.tell("delivered", seq=seq, receivers=1, lost=1, why="nobody knows whether it was executed")
+                self.tell("delivered", seq=seq, receivers=1, lost=1, why=UNKNOWN)
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
@@ -178,7 +178,8 @@ class Connection:
 
     async def _one(self, size_bytes: int, work: Work) -> None:
         try:
-            await self._hub.turns.of(self._caller.identity.key, work)
+            if self._ending is None:  # else its client says it again
+                await self._hub.turns.of(self._caller.identity.key, work)
         finally:
             self._release(size_bytes)
 
@@ -213,18 +214,17 @@ class Connection:
         try:
             who, no_drop, now_s = self._caller.identity, hub.is_no_drop(message.topic), hub.clock()
             new = protocol.check(message, self.session, self.permissions, self._quota, no_drop, now_s)
+            check_speed(message, self.permissions.speed(message.topic))
             hub.drivers.note(message.topic, self.session.name, address=who.address, email=who.email)
             if is_last(message.topic):
                 hub.audit("removed", topic=message.topic, session=self.session.name, **who.as_json())
             at_us = message.at_us or hub.now_us()
             message = message._replace(sender=self._admitted.name, stamp_us=message.stamp_us or at_us, at_us=at_us)
-            number = self._number(message) if message.no_drop and robot_of(message.topic) else 0
+            number = command_number(self.session, message.seq) if message.no_drop and robot_of(message.topic) else 0
             message = message._replace(number=number, seen="")
             message = hub.orders.dated(message, self.permissions.command_s(message.topic), hub.now_us())
             if is_stop(message.topic):
-                hub.holding.begin(
-                    self._confirm(message, hub.desk.order(message, who.email or self._admitted.name, who))
-                )
+                hub.holding.begin(self._confirm(message, hub.desk.order(message, self._shown, who)))
             elif not message.no_drop:
                 hub.publish(self, message)
             elif not new or await self._hold(message):
@@ -232,10 +232,11 @@ class Connection:
         except RefusedError as refused:
             self._refused(refused, message.topic, message.seq, message.no_drop)
 
-    def _number(self, message: wire.Message) -> int:
-        """Give a command's number: the same however often its client sends it."""
-        about = f"{self.session.identity.key}\n{self.session.name}\n{message.seq}".encode()
-        return int.from_bytes(hashlib.blake2b(about, digest_size=6).digest(), "big")
+    @property
+    def _shown(self) -> str:
+        """Who says a stop, as others see it; a name that reads as an e-mail but is not proved says so."""
+        name = self._admitted.name
+        return self._caller.identity.email or (f"{name} (not proved)" if "@" in name else name)
 
     async def _confirm(self, message: wire.Message, kept: asyncio.Future[None]) -> None:
         """Confirm a stop or a release once it is on the disk; until then its client says it again."""
@@ -294,7 +295,7 @@ class Connection:
             self._outbox.wake()
         else:
             subscription.offer(outgoing.message.topic, outgoing, outgoing.size_bytes)
-            self._outbox.offered()
+            self._outbox.offered(outgoing.size_bytes)
 
     def _answer_waits(self) -> None:
         self._outbox.wake()
@@ -316,8 +317,7 @@ class Connection:
 
 async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], None]) -> None:
     """Serve a client from its hello to the end; call ``greeted`` after the hello."""
-    hub, stage = caller.hub, "hello"
-    hello_s = hub.config.limits.hello_s
+    hub, stage, hello_s = caller.hub, "hello", caller.hub.config.limits.hello_s
     try:
         try:
             async with asyncio.timeout(hello_s):
@@ -331,6 +331,8 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             if (other := hub.claims.rival(admitted.robot, *about)) is not None:
                 hub.take_over(*other.key)
                 hub.store.forget(other)  # what waits for it is lost, as its senders are told
+        hub.take_over(caller.identity.key, admitted.session)
+        await hub.store.orders_done(caller.identity, admitted.session)
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             # Nothing is awaited from ``take_over`` to here, or a second connection of the session could come between.

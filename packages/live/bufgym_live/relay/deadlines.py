@@ -6,7 +6,7 @@ from typing import Any
 
 from bufgym_live.relay.clock import ASK_S, RelayClock
 from bufgym_live.relay.orders import COMMAND_S, is_stop, right, robot_of
-from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.wire import Message, RefusedError
 
 
@@ -50,7 +50,7 @@ class Deadlines:
         if not (self.clock.known and (robot_of(message.topic) or is_stop(message.topic))):
             return message
         topic = right(message.topic)
-        fits = (rule for rule in self._rules if rule.get("send") and for_client(rule["topic"]).fullmatch(topic))
+        fits = (rule for rule in self._rules if rule.get("send") and pattern(rule["topic"]).whole(topic))
         until_s = put_s + next(fits, {}).get("command_s", COMMAND_S)
         if self.clock.clock() > until_s:
             raise RefusedError("too_late", f"topic {message.topic}: the relay could not be reached in time")

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from bufgym_live.relay import wire
@@ -31,6 +32,8 @@ class Desk:
         self._send, self._holding = send, holding
         self.said: dict[str, Outgoing] = {}
         """Topic -> the message that says a robot's stops, for later subscribers."""
+        self._unwritten = dict[str, None]()
+        """Robots whose stops are not on the disk as they are here."""
         for robot, stop in store.stops():
             if orders.take(robot, [stop], ""):
                 self._told(robot)
@@ -66,7 +69,25 @@ class Desk:
         return outgoing
 
     def _keep(self, robot: str) -> asyncio.Future[None]:
-        return self._store.keep_stops(robot, list(self._orders.ledgers.get(robot, ())))
+        kept = self._store.keep_stops(robot, list(self._orders.ledgers.get(robot, ())))
+        kept.add_done_callback(partial(self._written, robot))
+        return kept
+
+    def _written(self, robot: str, kept: asyncio.Future[None]) -> None:
+        self._unwritten.pop(robot, None)
+        if kept.cancelled() or kept.exception() is not None:
+            self._unwritten[robot] = None
+
+    def tick(self) -> None:
+        """Write one robot's stops again that could not be written; when that succeeds, the others'."""
+        if self._unwritten:
+            self._holding.begin(self._rewritten())
+
+    async def _rewritten(self) -> None:
+        for robot in list(self._unwritten):
+            await self._kept(robot)
+            if robot in self._unwritten:
+                break
 
     async def _kept(self, robot: str) -> None:
         try:

@@ -8,8 +8,9 @@ the sender's messages shows it. So what waited on a stalled link moves nothing, 
 import asyncio
 import json
 import math
+import struct
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
@@ -19,6 +20,8 @@ from bufgym_live.relay import wire
 TOPIC: Final = "drive"
 MOST_MS: Final = 1_000
 """Longest deadline that a message may have."""
+TWIST: Final = "geometry_msgs/msg/Twist"
+_TWIST: Final = struct.Struct("<6d")
 _DRIFT: Final = 1e-3  # most that two clocks drift apart, s for each s
 
 
@@ -43,6 +46,20 @@ def _read(message: wire.Message) -> tuple[Velocity, float]:
         pass
     rule = f"must be JSON with the finite numbers linear and angular, and for_ms from 0 to {MOST_MS}"
     raise BufgymError(f"topic {message.topic}: {bytes(message.payload[:60])!r}: {rule}")
+
+
+def check_speed(message: wire.Message, most: float) -> None:
+    """Raise RefusedError if a message drives a robot at more than ``most`` m/s or rad/s, or at no number."""
+    if message.topic.endswith(f"/{TOPIC}"):
+        numbers: Sequence[float] = _read(message)[0]
+    elif message.type == TWIST and len(message.payload) == _TWIST.size + 4:
+        numbers = _TWIST.unpack_from(message.payload, 4)
+    else:
+        return
+    # A number that is none is not at most anything.
+    if fastest := [number for number in numbers if not abs(number) <= most]:
+        rule = f"must be at most {most:g} m/s and rad/s, the speed of the rule"
+        raise wire.RefusedError("wrong", f"topic {message.topic}: {fastest[0]:g}: {rule}")
 
 
 class Drive:

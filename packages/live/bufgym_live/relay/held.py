@@ -6,19 +6,22 @@ A message, its number to each receiver and the number of its sender are committe
 import math
 import os
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Final
 
 from bufgym.utils.errors import BufgymError
+from bufgym_live.relay import wire
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
 from bufgym_live.relay.disk import Disk
 from bufgym_live.relay.facts import Facts
+from bufgym_live.relay.orders import robot_of
 from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.rules import Identity
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import UNKNOWN, Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
 
 FILE: Final = "held.sqlite"
@@ -26,7 +29,8 @@ MOST: Final = 256
 """Settled messages of a session whose outcomes are remembered."""
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS session (
-    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER);
+    id INTEGER PRIMARY KEY, name TEXT, address TEXT, email TEXT, temporary INTEGER, received INTEGER, numbered INTEGER,
+    robot TEXT DEFAULT '');
 CREATE TABLE IF NOT EXISTS durable (session INTEGER, id TEXT, pattern TEXT, PRIMARY KEY (session, id)) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS message (
     id INTEGER PRIMARY KEY, sender INTEGER, seq INTEGER, topic TEXT, frame BLOB, receivers INTEGER,
@@ -38,8 +42,12 @@ CREATE TABLE IF NOT EXISTS outcome (
 CREATE TABLE IF NOT EXISTS robot (name TEXT PRIMARY KEY, seen_us INTEGER, said TEXT) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS stop (robot TEXT, who TEXT, said TEXT, PRIMARY KEY (robot, who)) WITHOUT ROWID;
 """
-_ADDED: Final = ("until_us INTEGER DEFAULT 0", "why TEXT DEFAULT ''")  # columns of message that earlier files lack
-_COLUMNS: Final = "id, name, address, email, temporary, received, numbered"
+_ADDED: Final = {
+    "message": ("until_us INTEGER DEFAULT 0", "why TEXT DEFAULT ''"),
+    "session": ("robot TEXT DEFAULT ''",),
+}
+"""Table -> columns that earlier files lack."""
+_COLUMNS: Final = "id, name, address, email, temporary, received, numbered, robot"
 
 
 class Held:
@@ -56,9 +64,10 @@ class Held:
             for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
                 self._db.execute(f"PRAGMA {pragma}")
             self._db.executescript(_SCHEMA)
-            for column in _ADDED:
-                with suppress(sqlite3.OperationalError):  # it is there
-                    self._db.execute(f"ALTER TABLE message ADD COLUMN {column}")
+            for table, columns in _ADDED.items():
+                for column in columns:
+                    with suppress(sqlite3.OperationalError):  # it is there
+                        self._db.execute(f"ALTER TABLE {table} ADD COLUMN {column}")
             self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
             (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
             if state != "ok":
@@ -80,9 +89,9 @@ class Held:
         """Read the sessions of the relay that ran before, and forget all that ended with it."""
         ended, found = list[StoredSession](), dict[tuple[str, str], StoredSession]()
         for row in self._db.execute(f"SELECT {_COLUMNS} FROM session ORDER BY id").fetchall():
-            id, name, address, email, temporary, received, numbered = row
+            id, name, address, email, temporary, received, numbered, robot = row
             session = StoredSession(name, Identity(address, email), bool(temporary), received, numbered, id=id)
-            session.kept = True
+            session.kept, session.sent, session.robot = True, numbered, robot
             for one, text in self._db.execute("SELECT id, pattern FROM durable WHERE session = ?", (id,)):
                 with suppress(BufgymError):  # an earlier release took more; its client is told when it subscribes again
                     session.durable[one] = pattern(text)
@@ -100,6 +109,10 @@ class Held:
         (self.bytes,) = self._db.execute("SELECT coalesce(sum(length(frame)), 0) FROM message").fetchone()
         for session in ended:
             self.forget(session)
+        dated = "SELECT session, number, frame FROM delivery JOIN message ON id = message WHERE until_us > 0"
+        for id, number, frame in self._db.execute(dated).fetchall():
+            if wire.decode(frame, len(frame)).at_us > time.time() * 1e6:  # the clock went back: how old is it?
+                self.deny(self._by_id[id], number, UNKNOWN)
         yield from found.values()
 
     def look(self) -> None:
@@ -125,6 +138,11 @@ class Held:
         if session.id is not None:
             with self.bearable():
                 self._save(session)
+
+    def claimed(self, session: StoredSession) -> None:
+        """Write the robot that a session has claimed to be."""
+        with self.bearable():
+            self._save(session)
 
     def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Note that matching messages are held while the session is away."""
@@ -215,10 +233,10 @@ class Held:
 
     def settle_acked(self, session: StoredSession) -> None:
         """End the deliveries that the session has acked; if that cannot be written, a later ack does it."""
-        session.settling = False
+        session.settling, acked = False, session.acked  # read once: the event loop moves it on
         with self.bearable():
-            self._settle(session, 0, session.acked, 0)
-            for number in [one for one in session.answers if one <= session.acked]:
+            self._settle(session, 0, acked, 0)
+            for number in [one for one in list(session.answers) if one <= acked]:
                 session.answers.pop(number, None)
 
     def deny(self, session: StoredSession, number: int, why: str) -> None:
@@ -234,7 +252,7 @@ class Held:
         for id, number in self._db.execute(late, (now_us,)).fetchall():
             session = self._by_id.get(id)
             if session is not None and session.away_s < math.inf:
-                self.deny(session, number, why)
+                self.deny(session, number, session.why_not(number, why))
 
     def waits(self, sender: StoredSession, seq: int) -> bool:
         """Whether a message of this sender is still held."""
@@ -291,11 +309,12 @@ class Held:
             for statement in also:
                 self._db.execute(statement, (session.id,))
             for id, number in rows:
-                (sender, seq, receivers, waiting, gone, size_bytes, why) = self._db.execute(
+                (sender, seq, receivers, waiting, gone, size_bytes, why, topic) = self._db.execute(
                     "UPDATE message SET waiting = waiting - 1, lost = lost + ?, why = coalesce(nullif(?, ''), why) "
-                    "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why",
+                    "WHERE id = ? RETURNING sender, seq, receivers, waiting, lost, length(frame), why, topic",
                     (lost, session.answers.get(number, ""), id),
                 ).fetchone()
+                why = why or (UNKNOWN if gone and robot_of(topic) else "")
                 sizes.append(size_bytes)
                 if waiting == 0:
                     self._db.execute("DELETE FROM message WHERE id = ?", (id,))
@@ -315,9 +334,10 @@ class Held:
     def _save(self, session: StoredSession) -> None:
         """Write the session; a new one gets its id in a transaction of its own, so that the id is never rolled back."""
         who = session.identity
-        row = session.id, session.name, who.address, who.email, session.temporary, session.received, session.numbered
+        numbers = session.received, session.numbered, session.robot
+        row = session.id, session.name, who.address, who.email, session.temporary, *numbers
         with self.transaction():
-            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
+            insert = f"INSERT OR REPLACE INTO session ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
             id = self._db.execute(insert, row).lastrowid
         session.id = id
         self._by_id[id] = session

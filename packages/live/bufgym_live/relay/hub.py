@@ -65,10 +65,12 @@ class Hub:
         self.disks = [one for one in (self.store.disk, disk, self.audit.disk) if one is not None]
         self.holding = Tasks()  # orders that wait for the disk, also of connections that have ended
         self.drivers = Drivers(self.audit, clock)
-        self.claims = Claims(self.audit, lambda message: self.publish(None, message), clock, self.now_us)
+        self.claims = Claims(self.store, self.audit, lambda message: self.publish(None, message), clock, self.now_us)
+        self.orders.is_here = lambda robot: self.claims.get(robot) is not None
         self.roster = Roster(self.store, lambda message: self.publish(None, message), clock, self.now_us)
         self.own: list[Tape | Window | Roster] = [self.roster, *([] if self.tape is None else [self.tape])]
         self.making = asyncio.Lock()  # whose turn it is to make a queue
+        self.writing = asyncio.Lock()  # whose turn it is to write a large message
         self.replaying = asyncio.Lock()  # whose turn it is to read a recording
         self.turns = Turns()
         self._failed: set[str] = set()
@@ -316,6 +318,7 @@ class Hub:
         self.drivers.tick()
         self.quotas.tidy()
         self.store.tick(now_us)
+        self.desk.tick()
         if self.peers is not None:
             self.peers.tick()
         for disk in self.disks:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 from pathlib import Path
 from typing import Final
 
@@ -20,10 +21,10 @@ def place(relay: str, name: str) -> Path:
 
 
 class Kept:
-    """The file; ``fault`` says why it could not be read or written at the last try."""
+    """The file; ``fault`` says why it could not be read or written at the last try, ``is_behind`` that it must be."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.fault = path, ""
+        self.path, self.fault, self.is_behind = path, "", False
 
     def load(self) -> Ledger:
         """Read the stops. Of a file that cannot be read nobody knows whether one holds: so the robot is stopped."""
@@ -32,12 +33,18 @@ class Kept:
                 said = json.loads(file.read(_MOST_BYTES))
             if not isinstance(said, dict) or not isinstance(said.get("stops"), list):
                 raise ValueError('must be an object with a list "stops"')
-            return Ledger(read(said["stops"]))
+            stops = list(read(said["stops"]))
+            if len(stops) < len(said["stops"]):
+                raise ValueError("one of its stops is none")
+            return Ledger(stops)
         except FileNotFoundError:
             return Ledger()
         except (OSError, ValueError, RecursionError) as error:
+            # A who of its own: the release of an earlier damage is not one of this.
+            stopped = Ledger([Stop(f"file-{secrets.token_hex(8)}", 1, "its damaged file of stops", 1)])
+            self.save(stopped.as_json())  # so that it is the same one after a restart
             self.fault = f"{self.path}: {error}: which stops hold is not known, so it is stopped"
-            return Ledger([Stop(f"file-{self.path.name}"[:100], os.getpid(), "its damaged file of stops", 1)])
+            return stopped
 
     def save(self, stops: list[dict[str, object]]) -> None:
         """Write the stops; a power failure leaves the old file or the new one."""
@@ -54,6 +61,7 @@ class Kept:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-            self.fault = ""
+            self.fault, self.is_behind = "", False
         except OSError as error:
+            self.is_behind = True
             self.fault = f"{self.path}: {error.strerror or error}: its stops are forgotten when it restarts"

@@ -8,7 +8,7 @@ from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.outgoing import Outgoing
 
 MAX_BYTES: Final = 2**26
-"""Limit on all of them; beyond, the identity with the most loses its oldest."""
+"""Limit on all of them; beyond, the identity with the most loses its largest."""
 
 
 class Last:
@@ -34,11 +34,10 @@ class Last:
         self._bytes[owner] += outgoing.size_bytes
         while self._bytes.total() > MAX_BYTES:
             largest = max(self._bytes, key=self._bytes.__getitem__)
-            oldest = next(one for one, who in self._owners.items() if who == largest)
-            self._audit.repeated(
-                what="latched", code="store_full", why=f"topic {oldest}: its last message is forgotten"
-            )
-            self.forget(oldest)
+            sizes = {one: self._messages[one].size_bytes for one, who in self._owners.items() if who == largest}
+            gone = max(sizes, key=sizes.__getitem__)  # a map before the transforms, which are small
+            self._audit.repeated(what="latched", code="store_full", why=f"topic {gone}: its last message is forgotten")
+            self.forget(gone)
 
     def forget(self, topic: str) -> None:
         """Keep nothing of a topic."""

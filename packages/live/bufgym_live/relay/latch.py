@@ -16,7 +16,7 @@ class Latch:
         self.ledger = ledger
         self._came = asyncio.Event()
         self._by = ""  # who said the last stop
-        self._work: asyncio.Task[Any] | None = None
+        self._works: set[asyncio.Task[Any]] = set()  # several after a break
 
     @property
     def is_set(self) -> bool:
@@ -37,8 +37,8 @@ class Latch:
         if any(stop.holds for stop in new):
             came, self._came = self._came, asyncio.Event()
             came.set()
-            if self._work is not None:
-                self._work.cancel()  # now, not in a later turn of the event loop: until then it could go on
+            for work in self._works:
+                work.cancel()  # now, not in a later turn of the event loop: until then it could go on
         return new
 
     def refusal(self, message: Message) -> str:
@@ -47,13 +47,14 @@ class Latch:
 
     async def unless_stopped(self, work: "asyncio.Task[Any]") -> str:
         """Wait for the work on a command; a stop cancels it, and does not wait. Return why it did not end, if so."""
-        self._work, came = work, self._came
+        self._works.add(work)
+        came = self._came
         stopped = asyncio.ensure_future(came.wait())
         try:
             await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
         finally:
             stopped.cancel()
-            self._work = None
+            self._works.discard(work)
         if came.is_set():
             work.cancel()
             return f"withdrawn: stopped by {self._by}"

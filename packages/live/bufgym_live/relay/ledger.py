@@ -137,8 +137,10 @@ class Ledger:
         here = [stop for stop in self.held if stop.number <= names.get(stop.who, -1)]
         if self.held and not here:
             raise BufgymError(f"was stopped again, by {self.by}: release that")
+        # Later than all before, also by a clock that went back: the releases that went first are forgotten.
+        at_us = max(1, at_us, *(stop.released_us + 1 for stop in self))
         coming = [Stop(who, number) for who, number in names.items() if not self.knows(who, number)]
-        return self.take(stop._replace(released_by=by, released_us=max(1, at_us)) for stop in (*here, *coming))
+        return self.take(stop._replace(released_by=by, released_us=at_us) for stop in (*here, *coming))
 
     @property
     def seen(self) -> str:

@@ -10,7 +10,7 @@ the relay gives everybody the robot's ledger.
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from typing import Any, Final
@@ -104,6 +104,8 @@ class Orders:
     def __init__(self) -> None:
         self.ledgers: dict[str, Ledger] = {}
         """Robot -> its stops, the robot whose stops changed longest ago first."""
+        self.is_here: Callable[[str], bool] = lambda robot: False
+        """Whether there is such a robot."""
         self._owners: dict[str, str] = {}
         """Robot -> key of the identity that said its first stop."""
 
@@ -136,7 +138,7 @@ class Orders:
         """
         robot, said = stopped_robot(message.topic), order(message)
         if robot not in self.ledgers and said["command"] == STOP:
-            self._make_room(owner)
+            self._make_room(robot, owner)
         ledger = self.ledgers.get(robot) or Ledger()
         try:
             if said["command"] == STOP:
@@ -154,7 +156,7 @@ class Orders:
         ledger = self.ledgers.get(robot)
         if ledger is None:
             with suppress(RefusedError):
-                self._make_room(owner)
+                self._make_room(robot, owner)
                 ledger = Ledger()
         new = [] if ledger is None else ledger.take(stops)
         if ledger is not None and new:
@@ -166,8 +168,10 @@ class Orders:
         self.ledgers[robot] = ledger
         self._owners.setdefault(robot, owner)
 
-    def _make_room(self, owner: str) -> None:
+    def _make_room(self, robot: str, owner: str) -> None:
         """Forget a robot whose stops are all released, of the identity that has the most; a stop that holds stays.
+
+        For a robot that is here, also one goes that is not.
 
         Raises RefusedError: there is none.
         """
@@ -175,12 +179,14 @@ class Orders:
             return
         shares = Counter(self._owners.values())
         largest = max(shares, key=shares.__getitem__)
-        idle = (robot for robot, ledger in self.ledgers.items() if self._owners[robot] == largest and not ledger.held)
-        robot = next(idle, "")
-        if not robot and shares[owner] * 2 > shares[largest]:
+        its = [one for one, own in self._owners.items() if own == largest]
+        gone = next((one for one in self.ledgers if self._owners[one] == largest and not self.ledgers[one].held), "")
+        if not gone and self.is_here(robot):
+            gone = next((one for one in its if not self.is_here(one)), "")
+        if not gone and shares[owner] * 2 > shares[largest]:
             raise RefusedError("too_many", f"must be at most {MOST_ROBOTS} robots with stops")
-        robot = robot or next(one for one, own in self._owners.items() if own == largest)
-        del self.ledgers[robot], self._owners[robot]
+        gone = gone or its[0]
+        del self.ledgers[gone], self._owners[gone]
 
     def is_late(self, message: Message, now_us: int) -> bool:
         """Whether a message's deadline is over."""

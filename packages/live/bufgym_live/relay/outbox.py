@@ -15,10 +15,11 @@ from bufgym_live.relay import wire
 from bufgym_live.relay.caller import Caller
 from bufgym_live.relay.member import Member
 from bufgym_live.relay.outgoing import Outgoing
-from bufgym_live.relay.store import NOT_REACHED
+from bufgym_live.relay.stored import NOT_REACHED
 from bufgym_live.relay.subscriber import Lane, Subscription, make_one, next_lane
 from bufgym_live.relay.wire import WireError
 
+LARGE_BYTES: Final = 2**16  # Size of a message beyond which its writing takes long
 MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed
 
 
@@ -35,14 +36,19 @@ class Outbox:
         self._in_flight: deque[int] = deque()
         self.urgent: dict[str, Outgoing] = {}
         """Topic -> its last stop, which waits for nothing."""
+        self._in_turn = False  # whether what waits may be large
         self._fetching: asyncio.Future[tuple[int, str, bytes]] | None = None
 
     def wake(self) -> None:
         """Look for something to send."""
         self._awake.set()
 
-    def offered(self) -> None:
-        """Look for what came into the queues: at once if nothing else waits, or have the task do it."""
+    def offered(self, size_bytes: int) -> None:
+        """Look for what came into the queues, so large: at once if nothing else waits, or have the task do it."""
+        if size_bytes > LARGE_BYTES:
+            self._in_turn = True
+            self._awake.set()
+            return
         # While the task waits and nobody has woken it, no stop, answer or no_drop message could go first.
         if not (self._is_idle and not self._awake.is_set() and self._socket.takes_more and self._sent_at_once()):
             self._awake.set()
@@ -95,7 +101,15 @@ class Outbox:
         subscriptions = list(member.subscriptions.values())
         made = await make_one(subscriptions, self._hub.making)
         await self._socket.until_open()
-        if self._write_queued(subscriptions) is None:
+        if self._in_turn:
+            # A turn of the event loop for each: a stop is read, and goes, between two large ones.
+            async with self._hub.writing:
+                wrote = self.urgent or self._write_queued(subscriptions) is not None
+                await asyncio.sleep(0)
+        else:
+            wrote = self._write_queued(subscriptions) is not None
+        if not wrote:
+            self._in_turn = False
             return made
         await self._left()
         return True
@@ -142,11 +156,14 @@ class Outbox:
             over = self._hub.orders.is_over(message, self._hub.now_us())
             if member.permissions.allow("receive", topic) and not over:
                 self._in_flight.append(self._sent_number)
+                member.session.sent = max(member.session.sent, self._sent_number)
                 await self._send(Outgoing(message))
             else:
                 late = over and self._hub.orders.is_late(message, self._hub.now_us())
                 why = NOT_REACHED if late else "withdrawn by a stop" if over else "no rule lets its robot have it"
-                self._hub.store.denied(member.session, self._sent_number, why)
+                self._hub.store.denied(
+                    member.session, self._sent_number, member.session.why_not(self._sent_number, why)
+                )
         return True
 
     async def _send(self, outgoing: Outgoing) -> None:

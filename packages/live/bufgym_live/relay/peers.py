@@ -10,7 +10,6 @@ own receivers. NATS keeps it until every relay has taken it, also one that is aw
 import asyncio
 import hashlib
 import json
-import math
 import re
 import time
 from collections import defaultdict, deque
@@ -22,6 +21,7 @@ from bufgym_live.relay import policies, protocol, wire
 from bufgym_live.relay.answers import Answers
 from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.bus import HOLD, MESSAGE, TOLD, TRIES, Bus, options
+from bufgym_live.relay.clock import Delays
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_live.relay.hub import CONNECTED, Hub
 from bufgym_live.relay.ledger import read
@@ -34,24 +34,10 @@ from bufgym_live.relay.subscriber import Subscription, make_one, next_lane
 from bufgym_live.robot.tasks import Tasks, until_one_ends
 
 _RETRY_S: Final = 1.0
-_MINUTE_S: Final = 60.0
+_CLOCK_S, _CLOCK_TRIES = 0.2, 5  # in which a relay says its time, before a command of it is taken
 _SLOW_SHARE: Final = 0.25  # of late_s, beyond which fewer messages are taken at a time
 _MOST_RELAYS: Final = 1_000
 _MOST_DOUBTFUL: Final = 10_000
-
-
-class Delays:
-    """Delays of another relay's messages beyond the least of the last minutes. Two clocks never agree."""
-
-    def __init__(self) -> None:
-        self._since_s, self._before_s, self._least_s = -math.inf, math.inf, math.inf
-
-    def extra_s(self, delay_s: float, now_s: float) -> float:
-        """Take a message's delay by two clocks; give what exceeds the usual."""
-        if now_s - self._since_s > _MINUTE_S:
-            self._since_s, self._before_s, self._least_s = now_s, self._least_s, math.inf
-        self._least_s = min(self._least_s, delay_s)
-        return delay_s - min(self._before_s, self._least_s)
 
 
 class Peers:
@@ -74,7 +60,8 @@ class Peers:
         """Ids of the messages of which NATS has not said whether it has them, in order."""
         self._awake = asyncio.Event()
         self._answers = Answers(hub)
-        self._telling: deque[bytes] = deque()
+        hub.claims.told = lambda robot, address: self._tell(robot=robot, at=address)
+        self._telling: deque[dict[str, Any]] = deque()
         """What is to be said to the others before any message."""
         self._tasks = Tasks()
 
@@ -155,8 +142,7 @@ class Peers:
         while True:
             await self._awake.wait()
             self._awake.clear()
-            while self._telling:
-                await bus.tell(self._telling.popleft())
+            await self._tell_all(bus)
             while await make_one(list(self.subscriptions.values()), self._hub.making):
                 pass
             while (lane := next_lane(list(self.subscriptions.values()), self._hub.clock())) is not None:
@@ -170,8 +156,12 @@ class Peers:
                     except wire.RefusedError as refused:
                         self._note(refused)
                 lane.gone()
-                while self._telling:
-                    await bus.tell(self._telling.popleft())
+                await self._tell_all(bus)
+
+    async def _tell_all(self, bus: Bus) -> None:
+        while self._telling:
+            about = {"relay": self._settings.name, "put": time.time_ns() // 1000}
+            await bus.tell(json.dumps({**about, **self._telling.popleft()}).encode())
 
     def _offer_stops(self, message: wire.Message) -> None:
         if self._goes("receive", message.topic):
@@ -179,7 +169,8 @@ class Peers:
             self._tell(robot=stopped_robot(message.topic), stops=stops)
 
     def _tell(self, **said: Any) -> None:
-        self._telling.append(json.dumps({"relay": self._settings.name, **said}).encode())
+        if self._bus is not None:  # else the others ask for all once it is back
+            self._telling.append(said)
         self._awake.set()
 
     def _told(self, data: bytes) -> None:
@@ -189,12 +180,20 @@ class Peers:
         except (ValueError, RecursionError):
             said = None
         match said:
+            case {"relay": str(relay), "put": int(put)}:
+                self._delays[relay].extra_s(time.time() - put / 1e6, self._hub.clock())
+        match said:
+            case {"relay": str(), "clock": True}:
+                pass
             case {"relay": str(), "ask": True}:
+                self._tell(clock=True)
                 for outgoing in self._hub.desk.said.values():
                     self._offer_stops(outgoing.message)
             case {"relay": str(), "robot": str(robot), "stops": list(stops)} if "/" not in robot:
                 if self._goes("send", f"/robots/{robot}/{STOP}"):
                     self._hub.desk.take(robot, list(read(stops)), self, self.session.identity.key)
+            case {"relay": str(relay), "robot": str(robot), "at": str(address)}:
+                self._hub.claims.elsewhere(robot, relay[:100], address[:100])
             case {"relay": str(), "seq": int(number), "lost": int(lost), "why": str(why)}:
                 self._answers.came(number, lost, why)
             case _:
@@ -280,8 +279,10 @@ class Peers:
             self._answers.await_one(_number(self._id(sender, message)), sender, message)
 
     def tick(self) -> None:
-        """Give up the answers that do not come."""
+        """Give up the answers that do not come, and let the others compare clocks."""
         self._answers.tick()
+        if self._bus is not None:
+            self._tell(clock=True)
 
     def tell(self, op: str, **fields: Any) -> None:
         """Tell the others how a command of theirs ended."""
@@ -302,6 +303,14 @@ class Peers:
             return
         number = _number(id)
         message = None if relay == self._settings.name else self._read(heard)
+        if message is not None and "Left" in headers and relay not in self._delays:
+            # It may be as old as NATS keeps it: how old, its relay's clock tells.
+            if heard.metadata.num_delivered < _CLOCK_TRIES:
+                self._tell(ask=True)
+                await heard.nak(delay=_CLOCK_S)
+                return
+            self._note(f"relay {relay} does not say its time: a command of it, whose age is not known, is dropped")
+            message = None
         if message is not None and re.fullmatch("[0-9]{1,17}", put := headers.get("Put", "")):
             extra_s = self._delays[relay].extra_s(time.time() - int(put) / 1e6, self._hub.clock())
             message = self._dated(message, headers, extra_s)

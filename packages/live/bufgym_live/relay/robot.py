@@ -122,7 +122,7 @@ class Robot:
         self.client.subscribe(exactly(self.topic(STOP)), self._ordered)
         self.client.subscribe(exactly(self.topic("command")), self._command)
         self.client.subscribe(exactly(self.topic(TOPIC)), self._driven)
-        self.client.late, self.client.reads_on = self._late, True
+        self.client.late, self.client.reads_on, self.client.begun = self._late, True, self._begun
 
     def topic(self, name: str) -> str:
         """Put the robot's prefix before a topic's name."""
@@ -174,6 +174,8 @@ class Robot:
         """Run until the source has no more, or until cancelled."""
 
         async def status() -> None:
+            if self._kept.is_behind:
+                await self._write()
             self.say("status", self.status())
 
         async def queue() -> None:
@@ -293,12 +295,15 @@ class Robot:
         if any(stop.holds for stop in new):
             try:
                 await self.source.on_command({"command": STOP})
-            except BufgymError as error:
-                why = str(error)
+            except Exception as error:  # whatever it is, the stop is written down
+                why = str(error) if isinstance(error, BufgymError) else f"{type(error).__name__}: {error}"
+        await self._write()
+        self._say_answer(new[-1].id, why)
+
+    async def _write(self) -> None:
         async with self._saving:
             said = self.latch.ledger.as_json()
             await asyncio.to_thread(self._kept.save, said)
             self._said = said
         if self._kept.fault:
             self.client.note(self._kept.fault)
-        self._say_answer(new[-1].id, why)

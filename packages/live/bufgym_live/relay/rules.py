@@ -105,6 +105,10 @@ class Permissions:
             self._command_s[topic] = answer
         return answer
 
+    def speed(self, topic: str) -> float:
+        """Give the largest velocity on this topic, m/s and rad/s, by the first rule that lets it be sent."""
+        return next((rule.speed for rule in self.rules if rule.send and pattern(rule.topic).whole(topic)), 0.0)
+
     @property
     def receives(self) -> bool:
         """Whether a rule allows to receive anything."""

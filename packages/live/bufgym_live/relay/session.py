@@ -14,7 +14,7 @@ import re
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Container, Coroutine
 from typing import Any, Final
 from urllib.parse import SplitResult
 
@@ -23,7 +23,7 @@ from bufgym_live.relay.backoff import Backoff
 from bufgym_live.relay.deadlines import Deadlines
 from bufgym_live.relay.inbox import Inbox
 from bufgym_live.relay.orders import is_stop
-from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.patterns import Pattern, pattern
 from bufgym_live.relay.stops import Stops
 from bufgym_live.relay.unanswered import Unanswered
 from bufgym_live.relay.wanted import OnMessage, Wanted
@@ -81,9 +81,11 @@ class Session:
         """Called with a command that came after its deadline, in place of ``on_message``."""
         self.reads_on = False
         """Whether messages are read on while the program is at work on one, so that a stop overtakes them."""
+        self.begun: Container[int] = ()
+        """Numbers of commands that the program has begun: one that comes again after a break is not late."""
         self._token, self._tls, self._report = token, tls, say
         self._session = f"{re.sub('[^A-Za-z0-9._-]', '-', name)[:40]}-{os.urandom(8).hex()}"
-        self._no_drop: tuple[re.Pattern[str], ...] = ()
+        self._no_drop: tuple[Pattern, ...] = ()
         self._unanswered = Unanswered(self.deadlines.dated)
         self._stops = Stops(self.deadlines.dated, self._session)
         self._inbox = Inbox()
@@ -258,7 +260,7 @@ class Session:
         self.welcome = said
         self.deadlines.welcomed(said)
         await self._stops.send(self._connection.send)
-        self._no_drop = tuple(map(for_client, said.get("no_drop", ())))
+        self._no_drop = tuple(map(pattern, said.get("no_drop", ())))
         if not self.stands_in:
             self._unanswered.resume(said["received"], max(1, said["window"]), self.check_size)
         for subscription in self._subscriptions.asked(self.stands_in):
@@ -310,7 +312,7 @@ class Session:
     async def _take(self, message: wire.Message) -> None:
         if message.no_drop and message.seq <= self._received[self.stands_in]:
             return  # it came before the connection broke
-        if self.deadlines.is_late(message):
+        if self.deadlines.is_late(message) and message.number not in self.begun:
             self.late(message)
             why = "came too late"
         else:

@@ -16,15 +16,15 @@ from typing import Final
 
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Config
-from bufgym_live.relay.disk import Disk
+from bufgym_live.relay.disk import STALL_S, Disk
 from bufgym_live.relay.held import Held
 from bufgym_live.relay.ledger import Stop
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
-from bufgym_live.relay.stored import Settled, StoredSession
+from bufgym_live.relay.stored import NOT_REACHED, Settled, StoredSession
 from bufgym_live.relay.wire import RefusedError
 
-NOT_REACHED: Final = "not reached: its robot was away until the deadline"
+_POLL_S: Final = 0.005
 
 
 class Store:
@@ -77,6 +77,15 @@ class Store:
         if session is not None and (received > session.received or numbered > session.numbered):
             await self.disk.do(self._held.remember, session, received, numbered)
 
+    async def orders_done(self, identity: Identity, name: str) -> None:
+        """Wait until a session's orders of an earlier connection are done, unless the disk stalls.
+
+        Otherwise its client would not know that a message was taken, and might give another one its number.
+        """
+        session, until_s = self.sessions.get((identity.key, name)), self._clock() + STALL_S
+        while session is not None and session.orders and self._clock() < until_s:
+            await asyncio.sleep(_POLL_S)
+
     def open(self, name: str, identity: Identity, temporary: bool, received: int, acked: int) -> StoredSession:
         """Open the session of this name; a new session begins at the client's numbers.
 
@@ -120,6 +129,12 @@ class Store:
     def _forget(self, session: StoredSession) -> None:
         if not self._held.forget(session):
             self.disk.on_loop(self.sessions.setdefault, session.key, session)
+
+    def claimed(self, session: StoredSession, robot: str) -> None:
+        """Note the robot that a session has claimed to be, also for a relay that starts anew."""
+        if session.robot != robot or not session.kept:
+            session.robot, session.kept = robot, True
+            self.disk.later(self._held.claimed, session)
 
     async def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Hold matching messages while the session is away.
@@ -188,6 +203,7 @@ class Store:
 
     def denied(self, session: StoredSession, number: int, why: str) -> None:
         """Drop a message that the session must not have any more."""
+        session.answers[number] = why  # at once: an ack of a later one may be written first
         self.disk.later(self._held.deny, session, number, why)
 
     def waits(self, sender: StoredSession, seq: int) -> asyncio.Future[bool]:

@@ -1,11 +1,15 @@
 """A client's session as the relay keeps it, and how a message ended."""
 
+import hashlib
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
+
+NOT_REACHED: Final = "not reached: its robot was away until the deadline"
+UNKNOWN: Final = "nobody knows whether it was executed"
 
 
 @dataclass(eq=False)
@@ -25,6 +29,7 @@ class StoredSession:
     orders: int = 0  # number of its orders that wait for the disk
     id: int | None = None  # id on disk, which only the disk's thread reads
     acked: int = 0  # highest number that it has acked
+    sent: int = 0  # highest number that a connection of it was given: what it has not acked it may have executed
     settling: bool = False  # whether acks wait to be written
     robot: str = ""  # the robot that it has claimed to be
     heard_s: float = -math.inf  # when its client said something last, by the relay's clock
@@ -36,10 +41,20 @@ class StoredSession:
         """Identity and name; the same name under another identity is another session."""
         return self.identity.key, self.name
 
+    def why_not(self, number: int, why: str) -> str:
+        """Say why a message for it ends without its ack: ``why``, unless it was given to it before."""
+        return UNKNOWN if number <= self.sent else why
+
     @property
     def unused_s(self) -> float:
         """Time from which on it may be forgotten; infinity while it is here, or an order of it waits."""
         return math.inf if self.orders else self.away_s
+
+
+def command_number(session: StoredSession, seq: int) -> int:
+    """Give a command's number: the same however often its client sends it."""
+    about = f"{session.identity.key}\n{session.name}\n{seq}".encode()
+    return int.from_bytes(hashlib.blake2b(about, digest_size=6).digest(), "big")
 
 
 class Settled(NamedTuple):

@@ -2,11 +2,11 @@
 
 import asyncio
 import inspect
-import re
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple
 
-from bufgym_live.relay.patterns import for_client
+from bufgym_live.relay.patterns import Pattern
+from bufgym_live.relay.patterns import pattern as compiled
 from bufgym_live.relay.wire import Message
 
 OnMessage = Callable[[Message], Awaitable[str | None] | str | None]
@@ -16,7 +16,7 @@ OnMessage = Callable[[Message], Awaitable[str | None] | str | None]
 class SubscriptionRequest(NamedTuple):
     """A subscription that is asked of the relay."""
 
-    pattern: re.Pattern[str]
+    pattern: Pattern
     on_message: OnMessage
     fields: dict[str, Any]
 
@@ -33,7 +33,7 @@ class Wanted:
         """Add a subscription; return the fields of its request, without those that are None."""
         id = str(len(self._requests))
         fields = {"id": id, "topic": pattern, **{key: value for key, value in chosen.items() if value is not None}}
-        self._requests[id] = SubscriptionRequest(for_client(pattern), on_message, fields)
+        self._requests[id] = SubscriptionRequest(compiled(pattern), on_message, fields)
         return fields
 
     def asked(self, stands_in: bool) -> list[SubscriptionRequest]:
@@ -46,7 +46,7 @@ class Wanted:
 
     async def call(self, message: Message) -> str:
         """Call the functions of all subscriptions that a message matches; return why one did not execute it."""
-        takers = [one for one in self._requests.values() if one.pattern.search(message.topic)]
+        takers = [one for one in self._requests.values() if one.pattern.part(message.topic)]
         whys = [await _called(one.on_message, message) for one in takers]
         return next(filter(None, whys), "") if takers else "nothing here takes it"
 

@@ -41,15 +41,17 @@ class Cuttable:
         if self._is_cut:
             writer.transport.abort()
             return
-        with contextlib.suppress(OSError):
-            there, back = await asyncio.open_connection("127.0.0.1", self._target)
-            self._writers |= {writer, back}
-            try:
+        ends = {writer}
+        try:
+            with contextlib.suppress(OSError):
+                there, back = await asyncio.open_connection("127.0.0.1", self._target)
+                ends.add(back)
+                self._writers |= ends
                 await until_one_ends(self._carry(reader, back), self._carry(there, writer))
-            finally:
-                self._writers -= {writer, back}
-                for one in (writer, back):
-                    one.transport.abort()
+        finally:
+            self._writers -= ends
+            for one in ends:
+                one.transport.abort()
 
 
 @contextlib.asynccontextmanager

@@ -182,10 +182,10 @@ def full_disk() -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def process(port: int, folder: Path, table: str = "") -> AsyncIterator[Any]:
+async def process(port: int, folder: Path, table: str = "", command_s: float = 86_400) -> AsyncIterator[Any]:
     """A relay in a process of its own; it is killed in the end, without warning."""
     config = folder / "relay.toml"
-    rule = '[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\ncommand_s = 86400\n'
+    rule = f'[[rules]]\naddress = "127.0.0.1"\nsend = true\nreceive = true\ncommand_s = {command_s}\n'
     config.write_text(f'port = {port}\nfolder = "held"\npolicies = ["drop-oldest"]\n{rule}{table}')
     words = ["-um", "bufgym", "relay", "serve", "--config", str(config)]
     one = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=asyncio.subprocess.PIPE)

@@ -207,3 +207,20 @@ async def test_a_stop_outlives_relay_and_robot(tmp_path: Path) -> None:
     await life(kept, stands)
     await life(kept, release)
     await life(kept, goes)
+
+
+async def test_a_relay_that_starts_anew_knows_its_robots(tmp_path: Path) -> None:
+    """A command that comes before its robot is back waits for it, although others watch."""
+    rule = Rule(address="127.0.0.0/8", send=True, receive=True, command_s=60)
+    kept = settings(folder=tmp_path, rules=(rule,))
+    async with relay(kept) as server, client(server.port, session="r", robot="r"):
+        pass
+    async with relay(kept) as server, client(server.port) as watch:
+        await watch.subscribe("^/robots/")
+        operator = Session(f"ws://127.0.0.1:{server.port}", "operator")
+        async with beside(operator.run()):
+            goal = asyncio.ensure_future(operator.command("/robots/r/command", {"command": "goal"}))
+            await until("it is held", lambda: server.hub.status()["held"] == 1)
+            async with client(server.port, session="r", robot="r") as robot:
+                await robot_does(robot, 1)
+                await wait("its receipt", goal)

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import struct
 from typing import Any
 
 import pytest
@@ -10,9 +11,10 @@ from refusal_cases import refuse
 from relay_cases import client, relay, settings, until, wait
 
 from bufgym_live.relay.config import Rule
-from bufgym_live.relay.drive import STILL, Drive, Drivers, Velocity
+from bufgym_live.relay.drive import STILL, TWIST, Drive, Drivers, Velocity, check_speed
 from bufgym_live.relay.robot import Robot
-from bufgym_live.relay.wire import Message
+from bufgym_live.relay.rules import Identity, Permissions
+from bufgym_live.relay.wire import Message, RefusedError
 
 
 def said(stamp_s: float, linear: Any = 0.5, angular: Any = 0.0, for_ms: Any = 400, sender: str = "ann") -> Message:
@@ -50,6 +52,31 @@ def test_a_velocity_ends_at_its_deadline() -> None:
     assert drive.velocity == (0.5, 0.0)
     clock.s = 108.42  # clocks may have drifted apart by a thousandth of the 8 s
     assert drive.velocity == STILL
+
+
+def test_a_rule_bounds_the_speed() -> None:
+    """3 m/s and rad/s unless it says otherwise, in JSON and in a Twist; what is no number is none of these."""
+    twist = Message("/robots/r/to/cmd_vel", b"\0\1\0\0" + struct.pack("<6d", 0, 0, 0, 0, 0, -4.0), "cdr", TWIST)
+    for message in (said(1.0, 3.0, -3.0), twist._replace(payload=bytes(4) + bytes(48)), said(1.0)._replace(topic="/a")):
+        check_speed(message, 3.0)
+    check_speed(twist, 4.0)
+    rule = "must be at most 3 m/s and rad/s, the speed of the rule"
+    for wrong, what in ((said(1.0, 100.0), "100"), (said(1.0, 0.0, -3.5), "-3.5"), (twist, "-4")):
+        refuse(f"topic {wrong.topic}: {what}: {rule}", check_speed, wrong, 3.0, kind=RefusedError)
+    with pytest.raises(RefusedError, match="nan"):
+        check_speed(twist._replace(payload=bytes(4) + struct.pack("<6d", float("nan"), 0, 0, 0, 0, 0)), 3.0)
+    rules = (Rule(email="ann", send=True, speed=0.5), Rule(email="ann", send=True))
+    assert Permissions(rules, Identity(email="ann")).speed("/robots/r/drive") == 0.5
+
+
+async def test_too_fast_a_velocity_is_refused_by_the_relay() -> None:
+    async with relay(settings()) as server, client(server.port) as one, client(server.port) as robot:
+        await robot.subscribe("^/robots/r/drive$")
+        for linear in (1e308, 2.0):
+            await one.put("/robots/r/drive", said(1.0, linear).payload, encoding="json")
+        (refused,) = await one.rest()
+        assert refused["code"] == "wrong" and "1e+308: must be at most 3 m/s" in refused["why"]
+        assert [json.loads(bytes(message.payload))["linear"] for message in await robot.rest()] == [2.0]
 
 
 def test_what_waited_on_a_link_moves_nothing() -> None:

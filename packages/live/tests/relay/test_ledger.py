@@ -88,6 +88,20 @@ def test_a_ledger_stays_small_and_forgets_no_stop_that_holds() -> None:
     assert ledger.say("h0-2", "", 1) and len(ledger.held) == MOST_HELD
 
 
+def test_a_release_by_a_clock_that_went_back_is_the_last() -> None:
+    """So many are released that the first ones go. One released by a clock an hour behind is none of these."""
+    relay, robot, hour_us = Ledger(), Ledger(), 3_600_000_000
+    for k in range(MOST_RELEASED):
+        relay.say(f"w{k}-1", "", 2 * hour_us)
+        relay.release([f"w{k}-1"], "", 2 * hour_us)
+    relay.say("ann-1", "", hour_us)
+    robot.take(relay)
+    assert [stop.id for stop in relay.release(["ann-1"], "", hour_us)] == ["ann-1"]
+    robot.take(relay)
+    relay.take(robot)
+    assert robot.held == relay.held == [] and "ann" in relay.seen
+
+
 DEPTHS = [7, pytest.param(10, marks=pytest.mark.nightly)]
 
 
@@ -136,7 +150,14 @@ def test_a_robots_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept.save(ledger.as_json())
     assert (list(Kept(path).load()), kept.fault) == ([Stop("ann", 1, "ann", 5)], "")
     path.write_text("{")
-    assert kept.load().held and "so it is stopped" in kept.fault
+    first = kept.load()
+    assert first.held and "so it is stopped" in kept.fault
+    assert list(Kept(path).load()) == list(first)  # the same stop after a restart
+    first.release([first.held[0].id], "ann", 6)
+    path.write_text('{"stops": [{"id": "ann-1", "at_us": "noon"}]}')
+    again = kept.load()
+    again.take(first)
+    assert again.held  # the release of the first damage is none of the second
     kept.path = tmp_path / "bufgym" / path.name / "no folder.json"
     kept.save([])
     assert "forgotten when it restarts" in kept.fault

@@ -1,5 +1,6 @@
 """Relays whose NATS server is away, stands still, forgets, or does not let them in."""
 
+import json
 import signal
 import sys
 from pathlib import Path
@@ -11,8 +12,9 @@ from relay_cases import client, nothing, relay, settings, until, untrusted, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import Nats, StoreLimits
+from bufgym_live.relay.clock import Delays
 from bufgym_live.relay.hub import Hub
-from bufgym_live.relay.peers import Delays, Peers
+from bufgym_live.relay.peers import Peers
 from bufgym_live.robot.sockets import free_port
 
 pytestmark = needs_server
@@ -185,3 +187,15 @@ def test_credentials_are_looked_at_before_the_start(tmp_path: Path, monkeypatch:
     with pytest.raises(BufgymError, match=r"url = 'nats://west\.example': must be nats://HOST:PORT") as failed:
         Nats("nats://west:p#ss@west.example", "a")
     assert "p#ss" not in str(failed.value)
+
+
+async def test_two_robots_of_one_name_at_two_relays_are_told(tmp_path: Path) -> None:
+    """The second one claims its name at its own relay; whoever watches at the first relay is told."""
+    port = free_port("127.0.0.1")
+    async with nats_server(port, tmp_path), shared(port, "a") as a, shared(port, "b") as b, client(a.port) as watch:
+        await connected(a, b)
+        await watch.subscribe("^/robots/r/claim$")
+        async with client(a.port, session="one", robot="r") as one, client(b.port, session="two", robot="r"):
+            await one.put("/robots/r/odom")
+            said = json.loads(bytes((await watch.next()).payload))
+    assert said["why"] == "two robots have this name: one at 127.0.0.1, at relay b"

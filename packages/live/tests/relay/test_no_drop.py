@@ -20,11 +20,11 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import backoff
 from bufgym_live.relay.audit import Audit
 from bufgym_live.relay.config import Limits, Rotation, Rule, StoreLimits
-from bufgym_live.relay.held import Settled
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import Identity
 from bufgym_live.relay.session import Session
 from bufgym_live.relay.store import Store
+from bufgym_live.relay.stored import UNKNOWN, Settled
 from bufgym_live.relay.wire import RefusedError
 from bufgym_live.robot.sockets import free_port
 
@@ -102,7 +102,7 @@ async def test_who_acks_nothing_blocks_nobody(corner: Corner) -> None:
             said = [await operator.next()]
             if seq > 4:
                 said.append(await operator.next())
-                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1} in said
+                assert {"op": "delivered", "seq": seq - 4, "receivers": 2, "lost": 1, "why": UNKNOWN} in said
             assert {"op": "ack", "seq": seq} in said
             await robot.came(seq)
             await robot.say("ack", seq=seq)
@@ -204,7 +204,7 @@ async def test_sessions_beyond_the_limit_take_the_place_of_the_dead(tmp_path: Pa
                     await operator.acked(COMMAND, 1)
             async with client(server.port, session="a") as old, client(server.port, session="b") as other:
                 assert (await operator.next(), other.welcome["op"]) == (
-                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1},
+                    {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1, "why": UNKNOWN},
                     "welcome",
                 )
                 async with client(server.port, session="a") as new, client(server.port, session="c") as more:
@@ -257,7 +257,7 @@ async def test_what_a_forgotten_session_had_to_get_is_told(corner: Corner) -> No
         await operator.acked(corner.command, 1)
         corner.hub.store.sessions[corner.address, "a"].away_s -= corner.hub.config.store.keep_s + 1
         corner.hub.tick()
-        assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1}
+        assert await operator.next() == {"op": "delivered", "seq": 1, "receivers": 1, "lost": 1, "why": UNKNOWN}
         forgotten = [entry for entry in corner.hub.audit.recent if entry["event"] == "forgotten"]
         assert [entry["held"] for entry in forgotten if entry["address"] == corner.address] == [1]
 

@@ -68,7 +68,7 @@ async def test_commands_wait_and_pictures_go_on(tmp_path: Path, go: threading.Ev
         client(server.port, session="o") as operator,
         client(server.port, session="a") as robot,
     ):
-        await robot.subscribe("command$", durable=True)
+        await robot.subscribe("^/robots/a/command$", durable=True)
         assert "200" in await health(server)
         go.clear()
         for seq in (1, 2, 3):
@@ -117,7 +117,7 @@ async def test_too_much_waits_for_the_disk(
     came = list[Any]()
     config = settings(folder=tmp_path, store=StoreLimits(bytes=1_000))
     async with relay(config) as server, client(server.port, session="a") as robot:
-        await robot.subscribe("command$", durable=True)
+        await robot.subscribe("^/robots/a/command$", durable=True)
         other = Session(f"ws://127.0.0.1:{server.port}", "other")
         async with beside(other.run()):
             await wait("a welcome", other.connected.wait())
@@ -131,11 +131,11 @@ async def test_too_much_waits_for_the_disk(
             await until("its end", lambda: len(server.hub.members) == 2)
             assert not waiting.done()
             go.set()
-            await wait("an answer", waiting)
             for _ in range(2):
                 message = await robot.next()
                 came.append(bytes(message.payload)[:2])
                 await robot.say("ack", seq=message.seq)
+            await wait("an answer", waiting)
             async with client(server.port, session="o") as operator:
                 assert operator.welcome["received"] == 1
     assert sorted(came) == [b'"x', b"1"]
@@ -145,7 +145,7 @@ async def test_a_session_whose_command_waits_keeps_its_place(tmp_path: Path, go:
     """One session at most. Another client is refused while the command waits; sent again, the command is taken once."""
     config = settings(folder=tmp_path, limits=Limits(sessions=1))
     async with relay(config) as server, client(server.port, local="127.0.0.2", session="a") as robot:
-        await robot.subscribe("command$", durable=True)
+        await robot.subscribe("^/robots/a/command$", durable=True)
         go.clear()
         async with client(server.port, session="o") as operator:
             await operator.command(1, COMMAND)

@@ -13,7 +13,7 @@ import pytest
 from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
-from bufgym_live.relay import caller, replay, server, turns, wire
+from bufgym_live.relay import caller, outbox, replay, server, turns, wire
 from bufgym_live.relay.connection import Connection
 from bufgym_live.relay.hub import MOST_IN_TURN
 from bufgym_live.relay.outgoing import Outgoing
@@ -52,6 +52,27 @@ class Others:
         while True:
             self.turn += 1
             await asyncio.sleep(0)
+
+
+async def test_large_messages_are_written_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A picture of 100 kB goes to five viewers: all others have a turn between any two."""
+    others, wrote = Others(), list[int]()
+    async with relay(settings()) as server, contextlib.AsyncExitStack() as stack, client(server.port) as one:
+        for _ in range(5):
+            viewer = await stack.enter_async_context(client(server.port))
+            await viewer.subscribe("^/picture$")
+        write = outbox.Outbox._write_queued
+
+        def writing(box: Any, *words: Any) -> Any:
+            lane = write(box, *words)
+            wrote.extend([others.turn] * (lane is not None))
+            return lane
+
+        monkeypatch.setattr(outbox.Outbox, "_write_queued", writing)
+        async with beside(others.run()):
+            await one.put("/picture", bytes(100_000))
+            await until("all to have it", lambda: len(wrote) == 5)
+        assert len(set(wrote)) == 5
 
 
 async def test_what_comes_together_is_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:

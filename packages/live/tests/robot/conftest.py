@@ -10,11 +10,10 @@ from collections.abc import Iterator
 
 import pytest
 from needs import needs
-from wire_cases import Wire
+from wire_cases import between  # noqa: F401  (a fixture)
 
-from bufgym_live.robot import sender, tunnel
+from bufgym_live.robot import sender
 from bufgym_live.robot.sockets import free_port
-from bufgym_live.robot.tunnel import Tunnel
 
 
 @pytest.fixture(autouse=True)
@@ -39,13 +38,3 @@ def broker_port() -> Iterator[int]:
             yield port
         finally:
             broker.kill()
-
-
-@pytest.fixture
-def between() -> Iterator[tuple[Tunnel, Wire]]:
-    if reason := tunnel.impossible():
-        pytest.skip(needs("root", reason))
-    with tunnel.opened() as made:
-        wire = Wire(made)
-        yield made, wire
-        wire.close()

@@ -7,9 +7,13 @@ import select
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import pytest
+from needs import needs
+
+from bufgym_live.robot import tunnel
 from bufgym_live.robot.receiver import Received, Receiver
 from bufgym_live.robot.tunnel import ADDRESSES, End, Tunnel
 
@@ -28,6 +32,8 @@ class Wire:
         """When the first one came."""
         self.packet_s = 0.0
         """Time that a packet takes."""
+        self.mute: int | None = None
+        """Device of the end whose packets are lost."""
         self._known, self._forgotten = set[bytes](), set[bytes]()
         self._ended = threading.Event()
         self._devices = {between.near.device: between.far.device, between.far.device: between.near.device}
@@ -57,7 +63,7 @@ class Wire:
                 with contextlib.suppress(OSError):
                     packet = os.read(device, 2000)
                     time.sleep(self.packet_s)
-                    if self._passes(packet):
+                    if device != self.mute and self._passes(packet):
                         os.write(self._devices[device], packet)
 
 
@@ -108,3 +114,13 @@ def waited(holds: Callable[[], Any]) -> None:
     while not holds():
         assert time.monotonic() < ends_s
         time.sleep(0.01)
+
+
+@pytest.fixture
+def between() -> Iterator[tuple[Tunnel, Wire]]:
+    if reason := tunnel.impossible():
+        pytest.skip(needs("root", reason))
+    with tunnel.opened() as made:
+        wire = Wire(made)
+        yield made, wire
+        wire.close()

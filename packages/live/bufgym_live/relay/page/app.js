@@ -59,6 +59,7 @@ const shows = (own, now) => ({
     if (one.name === chosen) hand.offerPolicies();
   },
   stopped(one) { if (own() === live) hand.stopped(one); },
+  claimed(name, why) { if (own() === live) notices.told(`claim ${name}`, `${name}: ${why}`, relay.clock.now()); },
   reframed(one) { if (own() === fleet && one.name === chosen) map.forget(); },
   scanned(one, pose, scan) { if (own() === fleet) map.addScan(pose, scan); },
   moved(isLayer = false) {
@@ -125,7 +126,7 @@ const hand = new Hand($, relay, map, notices, {
 function begin() {
   relay.subscribe("status", `${ALL}status$`);
   relay.subscribe("last", "^/robots/[^/]+/last$");
-  relay.subscribe("stops", "^/robots/[^/]+/stop$");
+  relay.subscribe("stops", "^/robots/[^/]+/(stop|claim)$");
   relay.subscribe("relay", "^/relay/status$");
   subscribe();
 }

@@ -23,7 +23,7 @@ export function split(topic) {
 }
 
 export class Fleet {
-  // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), stopped(robot), reframed(robot), scanned(robot, pose, scan), moved()}
+  // on: {nowMs(), drawn(robot), added(robot), here(robot), removed(name), status(robot), stopped(robot), claimed(name, why), reframed(robot), scanned(robot, pose, scan), moved()}
   constructor(on) {
     this.on = on;
     this.robots = new Map();
@@ -94,6 +94,7 @@ export class Fleet {
       if (known && stopsOf(json(message)?.stops).some(stop => stop.isHeld)) this.on.stopped(known);
       return;
     }
+    if (topic === "claim") return this.on.claimed(name, String(json(message)?.why ?? "").slice(0, 300));
     if (topic === "last") return this.takeLast(name, json(message), message.atMs ?? message.stampMs);
     if (isLatched && !this.robots.get(name)?.isHere) {
       if (this.early.size < EARLY) this.early.set(message.topic, message);

@@ -259,7 +259,7 @@ export class Relay {
 
   // Pass it on, once it is known whether it may be old; that a robot was stopped or removed waits for nothing.
   pass(message) {
-    if (/\/(stop|last)$/.test(message.topic) || this.isLatched(message.topic) !== undefined || this.early.length >= EARLY) this.on.message(message);
+    if (/\/(stop|claim|last)$/.test(message.topic) || this.isLatched(message.topic) !== undefined || this.early.length >= EARLY) this.on.message(message);
     else this.early.push(message);
   }
 }
