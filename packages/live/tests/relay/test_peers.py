@@ -228,6 +228,7 @@ async def test_a_relay_behind_a_slow_link_takes_few_messages_at_a_time(
     async with shared(port, "slow") as slow, client(a.port) as sender:
         peers: Any = slow.hub.peers
         taking = peers._bus
+        await until("each relay to have said its time", lambda: len(peers._delays) == len(relays))
         monkeypatch.setattr(peers, "_delays", {"a": Late()})
 
         async def send(k: int) -> None:
