@@ -166,6 +166,7 @@ class Robot:
             "driver": self._drive.driver,
             "stop": self.latch.status,
             "stops": self._said,
+            **({"unwritten": True} if self._kept.is_behind else {}),
             **own,
             "commands": sorted({*own.get("commands", ()), "stop", "release"}),
         }

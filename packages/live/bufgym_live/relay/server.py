@@ -262,6 +262,8 @@ async def serve_forever(config: Config, say: Any = print, load: Callable[[], Con
     port = await server.start()
     scheme = "http" if config.tls is None else "https"
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
+    if config.folder is None:
+        say("no folder: what is held, and stops of robots that are away, end with the relay")
     if server.hub.peers is not None and server.hub.peers.state != CONNECTED:
         say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:

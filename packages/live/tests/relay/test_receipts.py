@@ -135,7 +135,9 @@ async def test_what_a_full_disk_did_not_take_is_written_later(tmp_path: Path) ->
                     await wait("the stop", operator.stop("r"))
                 await until("it stands", lambda: robot.latch.is_set)
                 await until("it cannot be written", lambda: robot._kept.is_behind)
+                assert robot.status()["unwritten"] is True  # so nobody who says it takes it as kept
             await until("it is written", lambda: not robot._kept.is_behind)
+            assert "unwritten" not in robot.status()
             await until("it is written here, too", lambda: not server.hub.desk._unwritten)
     assert Kept(robot._kept.path).load().held
     async with relay(settings(folder=tmp_path)) as server:

@@ -150,8 +150,8 @@ export class Hand {
 
   // A robot's status: it may answer.
   answered(robot) {
-    const {answer: {id, why}, stops} = robot.status, {sent} = this;
-    this.relay.stops.heard(robot.name, stops, true);
+    const {answer: {id, why}, stops, unwritten} = robot.status, {sent} = this;
+    this.relay.stops.heard(robot.name, stops, true, !unwritten);
     const one = this.all?.open.get(robot);
     if (one !== undefined && (id === one || Stops.has(stops, one))) this.all?.open.delete(robot);
     if (!sent || sent.doneMs || sent.robot !== robot || !this.isDone(robot)) return;

@@ -115,11 +115,11 @@ export function queue(said) {
 const texts = said => (Array.isArray(said) ? said : []).slice(0, MOST_TOPICS).map(String);
 
 export function status(said) {
-  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, stop, stops, text, queue: its} = object(said);
+  const {answer, commands, driver, estop, location, network, ok, policies, publishes, receives, recording, stop, stops, text, unwritten, queue: its} = object(said);
   return {
     ...numbers(said, "battery"), network: numbers(network, "rtt_ms"), location: place(location), recording: String(recording ?? ""),
     driver: String(driver ?? "").slice(0, 300),
-    stops: stopsOf(stops), stop: stop ? {id: String(object(stop).id ?? ""), by: String(object(stop).by ?? "").slice(0, 100)} : null,
+    stops: stopsOf(stops), unwritten: unwritten === true, stop: stop ? {id: String(object(stop).id ?? ""), by: String(object(stop).by ?? "").slice(0, 100)} : null,
     ok: typeof ok === "boolean" ? ok : undefined, estop: estop === true, text: String(text ?? "").slice(0, 300),
     commands: texts(commands), receives: texts(receives), policies: texts(policies), queue: its && queue(its),
     answer: {id: String(object(answer).id ?? ""), why: String(object(answer).why ?? "").slice(0, 300)},

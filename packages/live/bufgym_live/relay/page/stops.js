@@ -51,8 +51,8 @@ export class Stops {
     return stops.some(stop => { const [other, its] = named(stop.id); return other === who && its >= number; });
   }
 
-  // What the relay or the robot knows; ``isRobot`` if it is the robot itself, which confirms what it has.
-  heard(robot, stops, isRobot = false) {
+  // What the relay or the robot knows; ``isRobot`` if it is the robot itself, which confirms what it has written down.
+  heard(robot, stops, isRobot = false, confirms = isRobot) {
     const ledger = this.ledgers.get(robot) ?? new Map();
     this.ledgers.set(robot, ledger);
     (isRobot ? this.robots : this.relay).set(robot, stops);
@@ -62,7 +62,7 @@ export class Stops {
     }
     for (const id of this.ids(robot)) {
       const [who, number] = named(id), known = ledger.get(who), isOver = known && (known.number > number || (known.number === number && !known.isHeld));
-      if (isOver || (isRobot && Stops.has(stops, id))) this.forget(id);
+      if (isOver || (confirms && Stops.has(stops, id))) this.forget(id);
     }
   }
 
