@@ -55,6 +55,7 @@ class Stage:
         self.loop = asyncio.get_running_loop()
         kept = settings(rules=(RULE,), limits=Limits(hello_s=60))
         async with relay(kept) as server, cuttable(server.port) as self.link:
+            self.port = server.port
             self.robot = Robot(f"ws://127.0.0.1:{server.port}", "car", self.car, policy="drop-oldest")
             async with beside(self.robot.run()), client(server.port, name="odd") as self.odd:
                 self.ready.set()
@@ -63,6 +64,17 @@ class Stage:
     def do(self, what: Any) -> None:
         """Call a function in the thread's loop."""
         self.loop.call_soon_threadsafe(what)
+
+    def gone(self) -> None:
+        """A third robot says what it takes, and is gone."""
+
+        async def say() -> None:
+            async with client(self.port, session="gone", robot="gone") as robot:
+                status = {"ok": True, "commands": ["goal", "stop"], "location": {"x": 1.0, "y": 2.0, "frame": "map"}}
+                await robot.put("/robots/gone/status", json.dumps(status).encode(), encoding="json")
+                await robot.rest()
+
+        asyncio.run_coroutine_threadsafe(say(), self.loop).result(60)
 
     def place(self, x: float, off_s: float = 0.0) -> None:
         """The second robot says where it is, in a message stamped so much off."""
@@ -115,6 +127,19 @@ def test_a_frozen_link_is_not_live_and_a_stop_is_kept_for_it(browser: Any, stage
         until(page, f"{text('.says')}.includes('stopped by page-')")
         page.click("#release")
         until(page, f"{COMMAND} === 'release: car answers: done'", "document.querySelector('#release').hidden")
+
+
+def test_a_command_that_reached_no_robot_says_so(browser: Any, stage: Stage) -> None:
+    """Its robot has just gone: the relay holds the goal for 3 s, and then says what became of it."""
+    with shows(browser, f"http://127.0.0.1:{stage.link.port}/") as page:
+        page.evaluate("location.hash = '#/robot/gone/overview'")
+        until(page, f"{STATE} === 'live'")
+        stage.gone()
+        until(page, "!document.querySelector('#goal').hidden")
+        page.click("#goal")
+        page.mouse.click(500, 400)
+        until(page, f"{COMMAND} === 'goal: held by the relay, until the robot answers'")
+        until(page, f"{text('#notices span')}.includes('goal: not reached')")
 
 
 def test_what_a_break_left_unconfirmed_is_asked_for_again(browser: Any, stage: Stage) -> None:

@@ -132,12 +132,18 @@ export class Hand {
     if (!way) return;
     const id = `${this.relay.name}-${++this.number}`, sent = this.sent = {id, kind, robot, state: "not sent yet"};
     this.draw();
+    const ended = said => {
+      if (!said.lost && !(way.type && said.why)) return;  // a robot that refused it says so in its status
+      this.notices.refused(robot.name, `${kind}: ${said.why}`, this.asks.nowMs(), () => this.send(kind, fields, robot));
+      if (this.sent === sent) this.sent = null;
+      this.draw();
+    };
     try {
       if (way.type) {
-        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, /** @type {any} */ (fields), this.relay.clock.now()), {type: way.type, encoding: "cdr"});
+        await this.relay.command(way.topic, kind === "stop" ? still() : stamped(way.type === ESTIMATE, /** @type {any} */ (fields), this.relay.clock.now()), {type: way.type, encoding: "cdr"}, ended);
         sent.state = "sent to its ROS, which does not answer";
       } else {
-        await this.relay.command(way.topic, {command: kind, id, ...fields});
+        await this.relay.command(way.topic, {command: kind, id, ...fields}, undefined, ended);
         if (sent.state === "not sent yet") sent.state = "held by the relay, until the robot answers";
       }
     } catch (error) {

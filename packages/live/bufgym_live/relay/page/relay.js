@@ -26,6 +26,7 @@ export class Relay {
     this.acked = 0;                                 // and the highest of ours that the relay holds
     this.subscriptions = new Map();
     this.commands = [];                             // not answered yet; the first is on its way
+    this.held = new Map();                          // number of a command that the relay holds -> who is told what became of it
     this.name = "page-" + [...crypto.getRandomValues(new Uint8Array(8))].map(byte => byte.toString(16).padStart(2, "0")).join("");
     this.stops = new Stops(this.name);
     this.token = sessionStorage.getItem("token");
@@ -67,6 +68,7 @@ export class Relay {
       if (this.welcome && performance.now() - this.since >= HELD_MS) this.mostMs = FIRST_MS;
       this.welcome = null;
       this.isLive = false;
+      this.held.clear();
       for (const {failed} of this.commands.splice(0)) failed(new Error("not confirmed before the link broke"));
       this.on.state("not connected", false);
       if (!this.refused) this.waits = setTimeout(() => this.connect(), Math.min(this.mostMs, isAway ? AWAY_MS : MOST_MS) * Math.random());
@@ -170,7 +172,8 @@ export class Relay {
   }
 
   // Done when the relay holds it, true; an error says why it does not. What it does not hold goes at once, false.
-  command(topic, data, fields = {encoding: "json"}) {
+  // ``ended`` is called with what became of it: {lost, why}.
+  command(topic, data, fields = {encoding: "json"}, ended = said => {}) {
     if (!this.isLive) return Promise.reject(new Error("not sent: the relay does not answer"));
     fields = {...fields, until_us: this.deadline(topic)};
     if (!this.holds(topic)) {
@@ -178,7 +181,7 @@ export class Relay {
       return Promise.resolve(false);
     }
     return new Promise((done, failed) => {
-      this.commands.push({topic, data, fields, done, failed});
+      this.commands.push({topic, data, fields, done, failed, ended});
       if (this.commands.length === 1) this.sendCommand();
     });
   }
@@ -221,6 +224,9 @@ export class Relay {
       this.rights.heard(said.rights);
       for (const message of this.early.splice(0)) this.pass(message);
       this.on.rights();
+    } else if (said.op === "delivered") {
+      this.held.get(said.seq)?.(said);
+      this.held.delete(said.seq);
     } else if (said.op === "refused") this.refuse(said);
     else this.on.said(said);
   }
@@ -228,7 +234,11 @@ export class Relay {
   answered(seq) {
     if (seq <= this.acked) return;
     this.acked = seq;
-    this.commands.shift()?.done(true);
+    const command = this.commands.shift();
+    if (command) {
+      command.done(true);
+      this.held.set(seq, command.ended);
+    }
     this.sendCommand();
   }
 
