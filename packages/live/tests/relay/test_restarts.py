@@ -135,9 +135,7 @@ async def test_a_relay_that_is_killed(rounds: int, tmp_path: Path, seed: int = 2
 
 @needs_server
 @long
-@pytest.mark.filterwarnings(
-    "ignore:unclosed:ResourceWarning"
-)  # of the library nats
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")  # of the library nats
 @pytest.mark.parametrize("rounds", FEW_ROUNDS)
 async def test_two_relays_over_nats(rounds: int, tmp_path: Path, seed: int = 3) -> None:
     """The robot is at one, the operators at the other. NATS is killed, too."""
