@@ -25,7 +25,7 @@ from bufgym_live.relay.clock import Delays
 from bufgym_live.relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_live.relay.hub import CONNECTED, Hub
 from bufgym_live.relay.ledger import read
-from bufgym_live.relay.orders import STOP, heard_stops, is_stop, stopped_robot
+from bufgym_live.relay.orders import STOP, heard_stops, is_stop, robot_of, stopped_robot
 from bufgym_live.relay.outgoing import Outgoing
 from bufgym_live.relay.patterns import pattern
 from bufgym_live.relay.rules import NATS, Permissions
@@ -232,8 +232,13 @@ class Peers:
         """Give the header with the time that a command has left, us: other relays have other clocks."""
         return {"Left": str(max(0, message.until_us - self._hub.now_us()))} if message.until_us else {}
 
-    def _dated(self, message: wire.Message, headers: Mapping[str, str], extra_s: float) -> wire.Message | None:
-        """Give a message of another relay its times by this relay's clock; None if it may not go on."""
+    def _dated(
+        self, message: wire.Message, headers: Mapping[str, str], extra_s: float, number: int = 0
+    ) -> wire.Message | None:
+        """Give a message of another relay its times by this relay's clock; None if it may not go on.
+
+        The sender of a command, which has a ``number``, is told why, if its robot is here.
+        """
         now_us, left = self._hub.now_us(), headers.get("Left", "")
         until_us = max(1, now_us + int(left) - round(extra_s * 1e6)) if re.fullmatch("[0-9]{1,15}", left) else 0
         here = message._replace(at_us=now_us, until_us=until_us)
@@ -241,6 +246,8 @@ class Peers:
             return self._hub.orders.dated(here, self.permissions.command_s(message.topic), now_us)
         except wire.RefusedError as refused:
             self._note(refused)
+            if number not in (0, self.session.received) and self._hub.claims.get(robot_of(message.topic)) is not None:
+                self._tell(seq=number, lost=0, why=str(refused))
             return None
 
     async def hold(self, sender: StoredSession, message: wire.Message) -> bool | None:
@@ -313,7 +320,7 @@ class Peers:
             message = None
         if message is not None and re.fullmatch("[0-9]{1,17}", put := headers.get("Put", "")):
             extra_s = self._delays[relay].extra_s(time.time() - int(put) / 1e6, self._hub.clock())
-            message = self._dated(message, headers, extra_s)
+            message = self._dated(message, headers, extra_s, number)
         # The last one comes again if NATS did not hear its ack.
         if message is not None and self._hub.is_no_drop(message.topic) and number != self.session.received:
             try:

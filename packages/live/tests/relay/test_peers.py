@@ -12,7 +12,7 @@ from relay_cases import client, nothing, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import Rule, Server, StoreLimits, bus
-from bufgym_live.relay.wire import Message, encode
+from bufgym_live.relay.wire import Message, RefusedError, encode
 from bufgym_live.robot.sockets import free_port
 
 pytestmark = needs_server
@@ -54,6 +54,23 @@ async def test_a_viewer_sees_a_robot_at_another_relay_as_far_as_rules_allow(rela
         assert (message.topic, message.sender, message.seq, message.stamp_us) == (odometry, "robot", 7, 5)
         assert seen.topic == odometry and len(seen.payload) == 50_000  # once, and not the secret
         assert await nothing(sender, viewer, guest)
+
+
+async def test_who_sent_a_command_is_told_why_the_relay_of_its_robot_refuses_it(
+    relays: list[Server], robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stop that the sender's relay has not heard of yet."""
+    a, b, _ = relays
+
+    def stopped(*words: Any) -> Any:
+        raise RefusedError("stopped", "it was stopped by ann")
+
+    monkeypatch.setattr(b.hub.orders, "dated", stopped)
+    name = robot.rpartition("/")[2]
+    async with client(a.port, session=f"{name}-o") as operator, client(b.port, session=name, robot=name):
+        await operator.acked(f"{robot}/command", 1)
+        told = {"op": "delivered", "seq": 1, "receivers": 1, "lost": 0, "why": "it was stopped by ann"}
+        assert await operator.next() == told
 
 
 async def test_a_command_arrives_once_at_a_robot_of_another_relay(relays: list[Server], robot: str) -> None:
