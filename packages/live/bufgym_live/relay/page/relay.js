@@ -225,6 +225,7 @@ export class Relay {
       for (const message of this.early.splice(0)) this.pass(message);
       this.on.rights();
     } else if (said.op === "delivered") {
+      this.answered(said.seq);                      // it may come before the ack, which it implies
       this.held.get(said.seq)?.(said);
       this.held.delete(said.seq);
     } else if (said.op === "refused") this.refuse(said);
