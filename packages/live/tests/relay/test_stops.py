@@ -252,7 +252,7 @@ async def test_a_stop_does_not_wait_for_a_program_at_work() -> None:
             await until("it stands", lambda: one.program.names == ["stop"])
             one.program.works.set()
             for goal in goals:
-                with pytest.raises(BufgymError, match="stopped by operator|withdrawn by a stop"):
+                with pytest.raises(BufgymError, match=r"stopped by operator|withdrawn by a stop"):
                     await wait("the receipt", goal)
         assert one.program.names == ["stop"]
 
