@@ -229,7 +229,12 @@ def _compiled(*functions: Any) -> Functions:
 def view_kind() -> Tuple:
     """The kind of a ``Buffer``."""
     constants = array_kind(float, constant=True)
-    kinds: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants, "past": array_kind(float)}
+    kinds: dict[str, Any] = {
+        "slots": array_kind(MESSAGE),
+        "v": constants,
+        "parameters": constants,
+        "past": array_kind(float),
+    }
     kinds |= {"topics": array_kind(TOPIC)}
     kinds |= {name: FLOAT for name, kind in get_type_hints(Buffer).items() if kind is float}
     return Tuple(tuple(kinds.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")

@@ -187,6 +187,13 @@ def beginning(**settings: float) -> NDArray[np.int64]:
     NumPy copies records field by field; it copies words five times as fast.
     """
     record = np.zeros(1, SENDER)
-    for name, number in {"first": 1, "finish_us": FOREVER, "measures": 1, "remembers": 1, "shows_left": 1, **settings}.items():
+    for name, number in {
+        "first": 1,
+        "finish_us": FOREVER,
+        "measures": 1,
+        "remembers": 1,
+        "shows_left": 1,
+        **settings,
+    }.items():
         record[name] = number
     return record.view(np.int64)

@@ -1,6 +1,6 @@
 """Fields of the past of link and camera, as ``bufgym.model.past`` remembers it; for one queue.
 
-None shows how long the stream has run by itself: that would be worth something only where all streams last equally long.
+None shows how long the stream has run: that is worth something only where all streams last equally long.
 """
 
 from typing import Any
@@ -65,7 +65,7 @@ PAST_FIELDS = (
               lambda buffer, arrival: over_mean(buffer)),
     _declared("top_rate", "link", "g/(g+r), r = rate over 2 s", "the highest rate over 0.5 s so far",
               lambda buffer, arrival: squash(buffer.past[p.TOP], buffer.long_rate_bytes_per_s)),
-    _declared("stalled", "link", "g/(g+r), r = 0.5 s",
+    _declared("stall_now", "link", "g/(g+r), r = 0.5 s",
               "how long the link has stalled, carrying under 3 % of its mean; 0 while it does not",
               lambda buffer, arrival: squash(buffer.past[p.STALLED_US], 0.5e6)),
     _declared("stall_last", "link", "g/(g+r), r = 1 s", "length of the last stall of at least 0.25 s; 0 for none",
@@ -79,7 +79,7 @@ PAST_FIELDS = (
     _declared("rate_correlation", "link", "(1 + c) / 2, c = correlation",
               "of the logarithm of the rate, from one second to the next, in about the last 12; 0.5 = unknown",
               lambda buffer, arrival: correlation(buffer)),
-    _declared("pace", "motion", "g/(g+r), r = mean of the whole run",
+    _declared("pace_now", "motion", "g/(g+r), r = mean of the whole run",
               "the camera's pace since the arrival before: 0.5 = as ever",
               lambda buffer, arrival: pace_now(buffer, arrival)),
     _declared("since_stop", "motion", "g/(g+r), r = 4 s",
