@@ -3,9 +3,9 @@
 All of it is measured on board: bytes that left the own socket, the own clock, the own odometry. The fields that show it
 are ``bufgym.model.observe.past``. An update takes one division, and one logarithm a second.
 
-The link's rate *now* is measured over at least ``LEAST_US`` in which the socket had bytes to send. It has *changed* where
-it is over ``CHANGE`` times the rate at the last change, or that is over ``CHANGE`` times the rate now. It *stalls* where
-it is under ``STALLS_BELOW`` of the mean of the whole run; a *stall* is at least ``STALL_US`` of that.
+The link's rate *now* is measured over at least ``LEAST_US`` in which the socket had bytes to send. It has *changed*
+where it and the rate at the last change differ by more than the factor ``CHANGE``. It *stalls* where it is under
+``STALLS_BELOW`` of the mean of the whole run; a *stall* is at least ``STALL_US`` of that.
 """
 
 import math

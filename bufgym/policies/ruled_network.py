@@ -57,7 +57,7 @@ EVEN_US, EVEN = 3e6, 2.5e-5
 its log rate below which it has not varied."""
 STATE = ("room", "log_capacity")
 """1 if there is room for the newcomer; log(L / 8)."""
-PER_CANDIDATE, QUEUE, OTHERS = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS), N_INPUTS + len(STATE)
+PER_CANDIDATE, QUEUE, N_STATE = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS), len(STATE)
 
 
 @kernel
@@ -66,7 +66,7 @@ def seen(candidates: int, remembers: bool = True) -> int:
 
     Networks of older files do not see the past.
     """
-    return PER_CANDIDATE * (candidates + 1) + QUEUE + OTHERS + (N_PAST if remembers else 0) + candidates + 2
+    return PER_CANDIDATE * (candidates + 1) + QUEUE + N_INPUTS + N_STATE + (N_PAST if remembers else 0) + candidates + 2
 
 
 def fields_seen(candidates: int) -> list[str]:
@@ -117,7 +117,7 @@ def look(
     by_rule = rule_decision(buffer, arrival, memory[RULE:])
     at = of_candidates + N_INPUTS
     numbers[at], numbers[at + 1] = 1.0 if room else 0.0, math.log(buffer.capacity / 8)
-    at += len(STATE)
+    at += N_STATE
     if remembers:
         past_inputs(buffer, arrival, numbers[at : at + N_PAST])
         at += N_PAST
