@@ -94,7 +94,7 @@ def header(
     reals = array_kind(float, constant=True)
     program.hook("bufgym_value_of", qoi.value, Pointer((reals, FLOAT), FLOAT))
     of = {kind: program.maker(program.c_type(kind)) for kind in (reals, array_kind(MESSAGE), array_kind(TOPIC))}
-    past = f"{of[array_kind(float)]}(q->past, {PAST})"
+    past = f"{of[reals]}(q->past, {PAST})"
     if policy.remembers:
         program.hook("bufgym_begin_past", begin_past, Pointer((array_kind(float), INT, FLOAT), None))
         noted = (array_kind(float), INT, INT, FLOAT, FLOAT, INT, INT, FLOAT)
