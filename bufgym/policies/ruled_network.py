@@ -30,7 +30,7 @@ from bufgym.model.observe import (
     is_offered,
     observe_candidates,
 )
-from bufgym.model.past import CHANGED_US, RATE
+from bufgym.model.past import CHANGED_US
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
 from bufgym.policies.past_inputs import N_PAST, PAST_INPUTS, PAST_NAMES, past_inputs
@@ -93,7 +93,7 @@ def even(buffer: Buffer, memory: Memory, remembers: bool) -> bool:
     """
     if remembers:
         past = buffer.past
-        return bool(past[RATE] > 0 and buffer.now_us - past[CHANGED_US] > EVEN_US and steady(buffer))
+        return bool(past[CHANGED_US] > 0 and buffer.now_us - past[CHANGED_US] > EVEN_US and steady(buffer))
     return bool(steady(buffer) and memory[LOG_RATE_VARIANCE] < EVEN and memory[RULE + SEEN_US] > EVEN_US)
 
 

@@ -60,7 +60,7 @@ def _declared(name: str, group: str, unit: str, meaning: str, function: Function
 PAST_FIELDS = (
     _declared("since_change", "link", "g/(g+r), r = 2 s",
               "time since the link's rate last changed by over 10 %; 0 before any",
-              lambda buffer, arrival: since(buffer, p.CHANGED_US, 2e6) if buffer.past[p.RATE] > 0 else 0.0),
+              lambda buffer, arrival: since(buffer, p.CHANGED_US, 2e6) if buffer.past[p.CHANGED_US] > 0 else 0.0),
     _declared("rate_over_mean", "link", "g/(g+r), r = mean of the whole run", "the link's rate over 2 s",
               lambda buffer, arrival: over_mean(buffer)),
     _declared("top_rate", "link", "g/(g+r), r = rate over 2 s", "the highest rate over 0.5 s so far",
