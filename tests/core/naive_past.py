@@ -1,7 +1,7 @@
 """Slow, obvious reference model of what a robot remembers of its link and its camera: from lists of all that came.
 
-Written from the fields' meanings; it calls no kernel. Its arguments are the arrivals so far, [(us, x)], the newest last,
-and ``measured``: what ``naive.Sender`` measured at each of them.
+Written from the fields' meanings; it calls no kernel. Arguments are the arrivals so far, [(us, x)], the newest last, and
+``measured``: what ``naive.Sender`` measured at each of them.
 """
 
 import math
@@ -23,7 +23,7 @@ def rates(arrivals, measured):
 
 
 def last_change(found):
-    """When the rate was last over 1.1 times what it was at the change before, or under 1 / 1.1 of it; None for never."""
+    """When the rate was last over 1.1 times that at the change before, or under 1 / 1.1 of it; None for never."""
     at, base = None, 0.0
     for now, rate, _, _ in found:
         if max(rate, base) > 1.1 * min(rate, base):
