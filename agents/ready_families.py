@@ -160,7 +160,7 @@ whose V saturates.
 
 
 def runs_of(family: str, split: str, most: int) -> list[Run]:
-    """So many runs of a family with their bounds: links and L by turns in a random order, each run with its own seed."""
+    """So many runs of a family with their bounds: links and L take turns, and each run has a seed of its own."""
     cells = [Cell(trace, part, c.capacity) for c in FAMILIES[family](split) for trace, part in by_trace(c.scenario)]
     order = np.random.default_rng(0).permutation(len(cells))
     found = [(cells[order[k % len(cells)]], FIRST_EPISODE[split] + k) for k in range(most)]

@@ -46,6 +46,8 @@ OTHER_WAYS = ("wifi-cafe", "wifi-campus", "wifi-office", "wifi-restr", "uplink-5
 """Modes of ``markov_link`` of which no training family has links."""
 UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
 """Suites over recorded uplinks."""
+AT_ONCE = 128
+"""Runs whose bounds are kept in one file."""
 SHORT_TO_LONG = (3, 5, 8, 16, 32)
 
 
@@ -128,15 +130,15 @@ FAMILIES: dict[str, Maker] = {
     "task": Maker(task),
     "frames": Maker(functools.partial(large_frames, MOVING, 36)),
     "fresh": Maker(functools.partial(large_frames, OTHER_WAYS, 35)),
-    "lte": Maker(functools.partial(of_suite, "lte-v2", (5, 15))),
-    "generated": Maker(functools.partial(of_suite, "generated-v2", (5, 15))),
+    "lte": Maker(functools.partial(of_suite, "lte-v2", (5, 15)), 4),
+    "generated": Maker(functools.partial(of_suite, "generated-v2", (5, 15)), 4),
     "outage": Maker(functools.partial(of_suite, "outage-v1", (5, 15))),
     "steady": Maker(functools.partial(of_suite, "sustained-v1", (5, 15))),
     "interruption": Maker(interruptions, 1),
-    "random": Maker(random_streams),
+    "random": Maker(random_streams, 4),
     "unequal": Maker(unequal, 4),
-    "equal-heavy": Maker(functools.partial(cameras, "heavy")),
-    "equal-light": Maker(functools.partial(cameras, "light")),
+    "equal-heavy": Maker(functools.partial(cameras, "heavy"), 4),
+    "equal-light": Maker(functools.partial(cameras, "light"), 4),
 }
 """Families of streams over made-up links."""
 
@@ -145,7 +147,7 @@ def chosen(data: str | None = None, only: Iterable[str] = ()) -> dict[str, Maker
     """The families of these names, by default all; with ``data``, a folder of recordings, recorded uplinks too."""
     known = dict(FAMILIES)
     if data:
-        known["uplinks"] = Maker(lambda: [place for name in UPLINKS for place in of_suite(name, (5, 15), data=data)])
+        known["uplinks"] = Maker(lambda: [place for name in UPLINKS for place in of_suite(name, (5, 15), data=data)], 4)
     for name in only:
         if name not in known:
             raise unknown("family", name, known)
@@ -194,9 +196,17 @@ def kept(file: Path, find: Callable[[], np.ndarray[Any, Any]]) -> np.ndarray[Any
     return np.asarray(np.load(file, allow_pickle=False))
 
 
-def bounded(name: str, maker: Maker, folder: Path) -> list[Run]:
-    """All runs of a family with their bounds, which take up to minutes and are kept in ``folder``."""
-    runs = drawn(maker)
-    file = folder / f"{name}-{digest(runs)}.npy"
-    bounds = kept(file, lambda: np.array([bound_of(run) for run in runs]))
-    return [{**run, "best": float(best)} for run, best in zip(runs, bounds, strict=True)]
+def bounded(name: str, maker: Maker, folder: Path, say: Callable[[str], None] = print) -> list[Run]:
+    """All runs of a family with their bounds, which take up to minutes and are kept in ``folder`` as they are found."""
+    runs, found = drawn(maker), list[float]()
+    for first in range(0, len(runs), AT_ONCE):
+        part = runs[first : first + AT_ONCE]
+        file = folder / f"{name}-{digest(part)}.npy"
+        if not file.exists() and first:
+            say(f"{name}: {first} of {len(runs)} bounds")
+        found += kept(file, functools.partial(_bounds, part)).tolist()
+    return [{**run, "best": best} for run, best in zip(runs, found, strict=True)]
+
+
+def _bounds(runs: Iterable[Run]) -> np.ndarray[Any, Any]:
+    return np.array([bound_of(run) for run in runs])

@@ -184,7 +184,7 @@ def judged_all(
     rows, parts, kept = list[Row](), list[Row](), dict[str, list[Run]]()
     began = time.monotonic()
     for name, maker in makers.items():
-        runs = families.bounded(name, maker, folder)
+        runs = families.bounded(name, maker, folder, say)
         found = judged(name, runs, rivals)
         rows, parts = [*rows, *found.rows], [*parts, *found.parts]
         if name in LAWS:
