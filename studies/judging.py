@@ -107,8 +107,8 @@ class Plan(NamedTuple):
 
 
 PLANS = {
-    "task, told the end": Plan("task", Planning(32, 20.0, True), 16, 4),
-    "task": Plan("task", Planning(32, 20.0, False), 16, 4),
+    "task, told the end": Plan("task", Planning(32, 20.0, True), 16, 2),
+    "task": Plan("task", Planning(32, 20.0, False), 16, 2),
     "lte": Plan("lte", Planning(32, 8.0, False), 12, 1),
 }
 """Futures, how far they reach, and whether the end is told."""
