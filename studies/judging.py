@@ -29,8 +29,6 @@ from studies.page import table, written
 RULES = ("target-gap", "price-dp", "gap-price")
 BY_CAPACITY = ("frames", "fresh")
 """Families each L of which is a row of its own. Of the others all L together are, and the parts stand below."""
-INEXACT = ("unequal",)
-"""Families that the mean leaves out, as the clairvoyant's H is only bounded there."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +86,8 @@ def judged(name: str, runs: Sequence[Run], rivals: Mapping[str, Policy]) -> Judg
 
 def mean_of(rows: Sequence[Row]) -> Row:
     """The mean of the rows; as many links as the row that has fewest make its interval."""
-    counted = [row for row in rows if row.name not in INEXACT]
-    shares = {name: np.mean([row.shares[name] for row in counted], axis=0) for name in counted[0].shares}
-    return Row("mean", sum(row.runs for row in counted), min(row.links for row in counted), shares)
+    shares = {name: np.mean([row.shares[name] for row in rows], axis=0) for name in rows[0].shares}
+    return Row("mean", sum(row.runs for row in rows), min(row.links for row in rows), shares)
 
 
 SAID = 16

@@ -5,7 +5,8 @@
     python -m studies.learned --data DIR --planner --out docs/agents.md
 
 Without a file it judges the agent that ships. ``--against`` names another agent of any kind, with which the first is
-compared in pairs. ``--planner`` adds the hindsight planner, ``--only task,lte`` judges on these families alone.
+compared in pairs. ``--planner`` adds the hindsight planner, ``--only task,lte`` judges on these families
+alone; ``unequal`` is judged only so.
 ``studies.families`` says what the rows are, ``studies.judging`` what the numbers are. Bounds and the planner's runs are
 kept in ``--folder``, so a run that was stopped goes on, and a second agent takes seconds.
 """
@@ -65,7 +66,7 @@ runs differ in everything, has a mean of ratios. No training saw these links or 
   links of seven others.
 - Each run has a jitter, an offset and a motion of its own.
 - In brackets are 95 % intervals over links: all runs of a link are drawn together.
-- `mean` is over the rows, but for `unequal`, where the clairvoyant is only bounded.
+- `mean` is the mean of the rows.
 
 {shares}
 
@@ -175,7 +176,7 @@ def main(
         files: agents, the one that is judged first; by default the one that ships.
         against: another agent, of any kind, with which the first is compared too.
         data: folder of recordings, to judge on recorded uplinks as well.
-        only: families to judge on, such as task,lte; by default all.
+        only: families to judge on, such as task,lte; by default all but unequal, whose bounds take minutes.
         planner: whether the hindsight planner plays as well, on some runs of task and lte.
         folder: where bounds and the planner's runs are kept.
         out: a Markdown file for the page of the agent that ships, such as docs/agents.md.

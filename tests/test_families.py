@@ -152,8 +152,7 @@ def test_rows_are_families_and_their_parts(tmp_path: Path) -> None:
     assert row.shares[row.best_rule][0] == min(row.shares[rule][0] for rule in judging.RULES)
     by_capacity = judging.judged("frames", runs, rivals)
     assert [part.name for part in by_capacity.rows] == ["frames, L = 4", "frames, L = 8"] and not by_capacity.parts
-    bounded_only = judging.Row("unequal", 1, 1, {name: shares + 9 for name, shares in row.shares.items()})
-    mean = judging.mean_of([*parts, bounded_only])
+    mean = judging.mean_of(parts)
     assert mean.share("copy").value == pytest.approx(np.mean([part.shares["copy"][0] for part in parts]))
     assert (mean.runs, mean.links) == (8, 2)
 
@@ -193,7 +192,13 @@ def test_two_files_of_one_name_are_told_apart_and_a_page_needs_a_network(tmp_pat
     other = (tmp_path / "b" / file.name).write_bytes(file.read_bytes()) and tmp_path / "b" / file.name
     assert list(learned.named([file, other])) == [str(file), str(other)]
     assert list(learned.named([file])) == ["old"]
+
+
+def test_families_are_all_but_those_whose_bounds_take_minutes() -> None:
     refuse("unknown family 'wifi'", families.chosen, None, ("wifi",))
+    assert [*families.chosen(), "unequal"] == sorted(families.FAMILIES, key="unequal".__eq__)
+    assert list(families.chosen(None, ("unequal", "task"))) == ["unequal", "task"]
+    assert list(families.chosen("DIR"))[-1] == "uplinks"
 
 
 @pytest.mark.skipif(not JIT, reason=needs("compiled", "without compilation a plan takes seconds"))
