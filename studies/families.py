@@ -146,7 +146,7 @@ BOUNDED = ("unequal",)
 
 
 def chosen(data: str | None = None, only: Iterable[str] = ()) -> dict[str, Maker]:
-    """The families of these names, by default all but ``BOUNDED``; with ``data``, a folder of recordings, uplinks too."""
+    """The families of these names, by default all but ``BOUNDED``; ``data``, a folder of recordings, adds uplinks."""
     known = dict(FAMILIES)
     if data:
         known["uplinks"] = Maker(lambda: [place for name in UPLINKS for place in of_suite(name, (5, 15), data=data)], 4)

@@ -5,10 +5,9 @@
     python -m studies.learned --data DIR --planner --out docs/agents.md
 
 Without a file it judges the agent that ships. ``--against`` names another agent of any kind, with which the first is
-compared in pairs. ``--planner`` adds the hindsight planner, ``--only task,lte`` judges on these families
-alone; ``unequal`` is judged only so.
-``studies.families`` says what the rows are, ``studies.judging`` what the numbers are. Bounds and the planner's runs are
-kept in ``--folder``, so a run that was stopped goes on, and a second agent takes seconds.
+compared in pairs. ``--planner`` adds the hindsight planner. ``--only task,lte`` judges on these families alone, and
+``unequal`` is judged only so. ``studies.families`` says what the rows are, ``studies.judging`` what the numbers are.
+Bounds and the planner's runs are kept in ``--folder``: a stopped run goes on, and a second agent is only played.
 """
 
 from __future__ import annotations
