@@ -58,7 +58,7 @@ TEST = """```
 ```
 
 Shares of AFR's regret: 0 is the clairvoyant, 1 AFR, less is better. A row's share is a ratio of sums; `random`, whose
-runs differ in everything, has a mean of ratios. No training saw these links or motions, and no choice was made by them.
+runs differ in everything, has a mean of ratios. Neither training nor validation saw these links or motions.
 
 - `task` has the links that the task holds out.
 - `frames` has the default frames of 4.6 MB over new links of the six ways of moving that training knows, `fresh` over
