@@ -1,4 +1,4 @@
-"""The families of links and streams by which agents for one queue are judged: no training and no choice saw them.
+"""The families of links and streams by which agents for one queue are judged: no training or validation saw them.
 
 A family is a list of *places*: a link, what is sent over it, and L. Each place has several runs, and each run a seed
 of its own. The seed draws the jitter and the offset on the link. Where the camera moves by a made-up drive, the drive

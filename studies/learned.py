@@ -58,7 +58,7 @@ TEST = """```
 ```
 
 Shares of AFR's regret: 0 is the clairvoyant, 1 AFR, less is better. A row's share is a ratio of sums; `random`, whose
-runs differ in everything, has a mean of ratios. No training saw these links or motions, and no choice was made by them.
+runs differ in everything, has a mean of ratios. Neither training nor validation saw these links or motions.
 
 - `task` has the links that the task holds out.
 - `frames` has the default frames of 4.6 MB over new links of the six ways of moving that training knows, `fresh` over
@@ -152,11 +152,13 @@ def _described(network: RuledWeights, notes: Mapping[str, Any]) -> dict[str, Any
     }
 
 
-def _line(files: Sequence[Path], against: Path | None, data: str | None, only: Sequence[str], planner: bool) -> str:
+def _line(
+    files: Sequence[Path], against: Path | None, data: str | None, only: Sequence[str], planner: bool, out: Path | None
+) -> str:
     """The command that makes the page again."""
     words = ["python -m studies.learned", *(map(str, files) if list(files) != [SHIPPED] else ())]
     words += [f"--against {against}"] * bool(against) + ["--data DIR"] * bool(data)
-    words += [f"--only {','.join(only)}"] * bool(only) + ["--planner"] * planner
+    words += [f"--only {','.join(only)}"] * bool(only) + ["--planner"] * planner + [f"--out {out}"] * bool(out)
     return " ".join(words)
 
 
@@ -184,7 +186,7 @@ def main(
     network, notes = weights.read(chosen[0]) if out else (None, {})
     if out and not isinstance(network, RuledWeights):
         raise BufgymError(f"{chosen[0]}: is no network among candidates and the decision of gap-price")
-    line = _line(chosen, against, data, only, planner)
+    line = _line(chosen, against, data, only, planner, out)
     text, short = tables(chosen, against, makers, folder, planner, line)
     if isinstance(network, RuledWeights):
         text = PAGE.format(**_described(network, notes), short=short) + text

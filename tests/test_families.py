@@ -188,8 +188,9 @@ def test_two_files_of_one_name_are_told_apart_and_a_page_needs_a_network(tmp_pat
     nothing = Network(np.zeros(1, np.float32), np.zeros(1, np.float32), (), np.zeros(0, np.float32))
     file = weights.save(tmp_path / "old.safetensors", Weights(("rank",), nothing, nothing), {"name": "old"})
     refuse("old.safetensors: is no network among candidates", learned.main, file, out=tmp_path / "page.md")
-    (tmp_path / "b").mkdir()
-    other = (tmp_path / "b" / file.name).write_bytes(file.read_bytes()) and tmp_path / "b" / file.name
+    other = tmp_path / "b" / file.name
+    other.parent.mkdir()
+    other.write_bytes(file.read_bytes())
     assert list(learned.named([file, other])) == [str(file), str(other)]
     assert list(learned.named([file])) == ["old"]
 
@@ -217,8 +218,13 @@ def test_the_planner_plays_some_runs_once(tmp_path: Path, monkeypatch: Patch) ->
     files = sorted(tmp_path.glob("planner-*.npy"))
     assert len(files) == 2
     files[0].unlink()
-    played = []
-    monkeypatch.setattr(judging, "qoi_of", lambda *rest: played.append(rest) or causal_planner.qoi_of(*rest))
+    played = list[int]()
+
+    def counted(run: Any, *rest: Any) -> float:
+        played.append(run["capacity"])
+        return causal_planner.qoi_of(run, *rest)
+
+    monkeypatch.setattr(judging, "qoi_of", counted)
     (again,) = judging.planned(runs, tmp_path, judging.rules())
     assert len(played) == 1 and (again.shares[causal_planner.NAME] == row.shares[causal_planner.NAME]).all()
 
