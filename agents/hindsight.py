@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,14 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from agents.held_out import split_scenario
 from agents.hindsight_network import Student, expected
-from agents.hindsight_rows import Lessons, Part, Ruled, TaughtRows
+from agents.hindsight_rows import Lessons, Part, TaughtRows
 from agents.learner import Learner
 from agents.mixed_env import Cell, cells
-from agents.ready_families import FAMILIES, STAYING
+from agents.ready_families import FAMILIES
 from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
-from bufgym.policies.ruled_network import seen
 from bufgym.utils.files import replaced
 
 MEAN = 0.995
@@ -53,8 +53,15 @@ EQUAL = 0.5
 """Share of a batch that families have in equal parts; the rest goes by what they still lose."""
 LOST = 0.99
 """Weight of the past in a family's mean loss, at each gradient step."""
+TOLD = 1 / 3
+"""Share of a family's rows that are told when their stream ends."""
 CURVE = 32
 """Steps of all rows from one row of the curve to the next."""
+
+
+def tells(cell: Cell) -> bool:
+    """Whether its robot may be told when its stream ends."""
+    return hasattr(cell.scenario, "tells_duration")
 
 
 class School:
@@ -140,13 +147,14 @@ class HindsightLearner(Learner[Hindsight]):
         on, chosen, n = self.settings.environment, self.settings.suites, self.settings.num_envs
         if self.settings.kind == "environment":
             return [Part("", Cell("", split_scenario(on)[0], on.capacity), n)]
-        found = {name: FAMILIES[name]("train") for name in self.settings.sets.names}
+        found = {name: FAMILIES[name]("train", chosen.data) for name in self.settings.sets.named(chosen.data)}
         found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.suite}
-        return [
-            Part(s, cell, math.ceil(n / len(found) / len(own)), s in STAYING)
-            for s, own in found.items()
-            for cell in own
-        ]
+        parts = []
+        for family, own in found.items():
+            told = [cell._replace(scenario=replace(cell.scenario, tells_duration=True)) for cell in own if tells(cell)]
+            for some, share in ((own, 1 - TOLD * bool(told)), (told, TOLD)):
+                parts += [Part(family, cell, math.ceil(share * n / len(found) / len(some))) for cell in some]
+        return parts
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed; a resumed one has its state of learning, and begins to collect anew."""
@@ -162,9 +170,8 @@ class HindsightLearner(Learner[Hindsight]):
         # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
         rng = np.random.default_rng([seed, school.steps])
         rows = TaughtRows(parts, settings.candidates, settings.ruled, rng)
-        k, families = settings.candidates, len(rows.families)
-        rule = Ruled(rows.stays, seen(k) - (k + 2)) if settings.ruled else None
-        lessons = Lessons(families, settings.room // families, (rows.seen.shape[1], rows.decisions.shape[1]), rule)
+        families = len(rows.families)
+        lessons = Lessons(families, settings.room // families, (rows.seen.shape[1], rows.decisions.shape[1]))
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)
         validations = Validations(home, objective.columns, objective.best, settings, school.steps)
         bar = seed_bar(settings.steps, school.steps, seed, line)

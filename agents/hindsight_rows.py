@@ -25,8 +25,6 @@ RULED = 6
 """The rule, action 0, plays one row in so many: good states never end, and a student that fell finds its way back."""
 LONGEST = 600
 """Most steps over which rows are spread at first."""
-LEAVING = 20.0
-"""Cost of leaving the rule in families that stay with it, in the same units."""
 MOST = 60.0
 """Largest cost, in units of the mean cost of action 0."""
 
@@ -37,8 +35,6 @@ class Part(NamedTuple):
     family: str
     cell: Cell
     rows: int
-    stays: bool = False
-    """Whether leaving the rule gap-price is what costs, in place of what the clairvoyant says."""
 
 
 class Lesson(NamedTuple):
@@ -48,15 +44,6 @@ class Lesson(NamedTuple):
     """float32[n, inputs]"""
     cost: NDArray[np.float32]
     """float32[n, actions], H given up for good by each action; infinite for those that are not offered."""
-
-
-class Ruled(NamedTuple):
-    """Where it is the rule gap-price that teaches: leaving it is what costs there."""
-
-    stays: NDArray[np.bool_]
-    """bool[families]: in the whole family."""
-    same: int
-    """First place of the flags of actions that do what the rule does; the last action is the rule's."""
 
 
 class TaughtRows:
@@ -71,13 +58,12 @@ class TaughtRows:
 
     def __init__(self, parts: Sequence[Part], candidates: int, ruled: bool, rng: np.random.Generator) -> None:
         self.families = list(dict.fromkeys(part.family for part in parts))
-        self.stays = np.array([any(part.stays and part.family == family for part in parts) for family in self.families])
         sizes = [part.rows for part in parts]
         self.n, ends = sum(sizes), np.cumsum(sizes).tolist()
         self.spans = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
         self.family = np.repeat([self.families.index(part.family) for part in parts], sizes)
         """int64[n]: number of each row's family."""
-        self.groups, self._players, self._teachers = [], [], list[Hindsight | None]()
+        self.groups, self._players, self._teachers = [], [], list[Hindsight]()
         for part in parts:
             options = Options(
                 capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="none"
@@ -85,7 +71,7 @@ class TaughtRows:
             sub_envs = SubEnvs(part.rows, part.cell.scenario, options)
             self.groups.append(sub_envs)
             self._players.append(Player(watcher(candidates), part.rows))
-            self._teachers.append(None if part.stays else Hindsight(sub_envs.senders, "train.py hindsight"))
+            self._teachers.append(Hindsight(sub_envs.senders, "train.py hindsight"))
         self._ruled = np.concatenate([np.arange(size) < max(size // RULED, size > 1) for size in sizes])
         self._candidates = candidates
         self.seen = np.zeros((self.n, seen(candidates) if ruled else inputs(candidates)), np.float32)
@@ -118,11 +104,8 @@ class TaughtRows:
         self._observe()
 
     def _by_rule(self) -> NDArray[np.int64]:
-        """int64[n]: action 0 of families that the clairvoyant teaches, otherwise what the rule does.
-
-        On an even link action 0 is not offered: there such a row accepts or rejects, as a queue does of itself.
-        """
-        return np.where(self.stays[self.family], self.decisions[:, -1], self.decisions[:, 0])
+        """int64[n]: action 0, or what the rule gap-price does where it alone is offered."""
+        return np.where(self.decisions[:, 0] == NOT_OFFERED, self.decisions[:, -1], self.decisions[:, 0])
 
     def scatter(self, rng: np.random.Generator) -> None:
         """Let the rule play until rows are at different moments of their episodes."""
@@ -141,11 +124,7 @@ class TaughtRows:
         """Play one decision in every row, and say what each action would have cost."""
         cost, offered = np.empty(self.decisions.shape), self.offered
         for span, teacher in zip(self.spans, self._teachers, strict=True):
-            decisions = self.decisions[span]
-            if teacher is None:
-                cost[span] = np.where(offered[span], 0.0, np.inf)
-                continue
-            values = teacher.values(np.where(offered[span], decisions, -1))
+            values = teacher.values(np.where(offered[span], self.decisions[span], -1))
             best = np.where(np.isnan(values), -np.inf, values).max(axis=1, keepdims=True)
             cost[span] = np.where(np.isnan(values), np.inf, best - values)
         lesson = Lesson(self.seen.copy(), cost.astype(np.float32))
@@ -160,8 +139,8 @@ class Lessons:
     ``shape`` is (numbers seen, actions).
     """
 
-    def __init__(self, families: int, room: int, shape: tuple[int, int], rule: Ruled | None = None) -> None:
-        self.room, self.counts, self._rule = room, np.zeros(families, np.int64), rule
+    def __init__(self, families: int, room: int, shape: tuple[int, int]) -> None:
+        self.room, self.counts = room, np.zeros(families, np.int64)
         self._seen, self._cost = (torch.zeros(families * room, size) for size in shape)
         self._of_rule, self._met = np.zeros(families), np.zeros(families)
 
@@ -190,8 +169,4 @@ class Lessons:
         units = torch.from_numpy(self.units[family].astype(np.float32))
         seen, cost = self._seen[places], self._cost[places]
         known = (cost / units[:, None]).clamp(max=MOST)
-        if self._rule is not None:
-            stays = torch.from_numpy(self._rule.stays[family])
-            leaves = LEAVING * (1 - torch.nn.functional.pad(seen[:, self._rule.same :], (0, 1), value=1.0))
-            known = torch.where(stays[:, None], leaves, known)
         return seen, torch.where(torch.isfinite(cost), known, cost)

@@ -1,4 +1,4 @@
-"""Fourteen families of links and streams, which one agent learns side by side.
+"""Ten families of links and streams, which one agent learns side by side.
 
 ``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
 their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,8 @@ from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
 MOVING = ("foot", "bicycle", "bus", "tram", "train", "car")
 FIRST_SEED = {"train": 20_000, "validation": 21_000, "test": 22_000}
 """Seeds of links made here count up from these."""
+UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
+"""Suites over recorded uplinks."""
 FRAMES = {"train": 96, "validation": 24, "test": 48}
 """Generated links at the default frames."""
 STREAMS = {"train": 96, "validation": 48, "test": 96}
@@ -83,56 +86,56 @@ def random_stream(seed: int) -> Cell:
     return Cell(link.name, scenario, L)
 
 
-def _task(split: str) -> list[Cell]:
+def _task(split: str, data: str | None = None) -> list[Cell]:
     on = Environment()
     return [Cell("", split_scenario(on)[split == "test"], on.capacity)]
 
 
-def _frames(split: str, capacities: Sequence[int] = (3, 4, 5, 8, 12, 16, 24, 32, 48, 100, 200)) -> list[Cell]:
+def _frames(split: str, data: str | None = None) -> list[Cell]:
     first = FIRST_SEED[split]
     scenario = frames_over(range(first, first + FRAMES[split]))
-    return [Cell("", scenario, L) for L in capacities]
+    return [Cell("", scenario, L) for L in (3, 4, 5, 8, 12, 16, 24, 32, 48, 100, 200)]
 
 
-def _kind(cell: Cell) -> str:
-    """Which of the families of random streams has this one: what the clairvoyant says of it decides."""
-    if cell.scenario.sizes != "equal":  # type: ignore[attr-defined]
-        return "random-unequal"
-    is_hopeful = cell.label.startswith("constant") or cell.scenario.value.name.startswith("saturating")
-    return "random-plain" if is_hopeful else "random"
+def _is_taught(cell: Cell) -> bool:
+    """Whether a network decides there at all; otherwise it leaves all to the rule."""
+    is_left = cell.label.startswith("constant") or cell.scenario.value.name.startswith("saturating")
+    return cell.scenario.sizes == "equal" and not is_left and cell.capacity > 2  # type: ignore[attr-defined]
 
 
 @functools.cache
-def _streams(split: str) -> list[Cell]:
-    return [random_stream(FIRST_SEED[split] + k) for k in range(STREAMS[split])]
+def _random(split: str, data: str | None = None) -> list[Cell]:
+    streams = (random_stream(FIRST_SEED[split] + k) for k in range(STREAMS[split]))
+    return [cell for cell in streams if _is_taught(cell)]
 
 
-def _random(split: str, kind: str, most: int = 96) -> list[Cell]:
-    return [cell for cell in _streams(split)[:most] if _kind(cell) == kind]
+def _uplinks(split: str, data: str | None = None) -> list[Cell]:
+    """Recorded uplinks; where no folder has recordings, there are none."""
+    names = UPLINKS if data else ()
+    return [cell for name in names for cell in _of_suite(name, (5, 15))(split, data)]
 
 
-def _short(split: str) -> list[Cell]:
-    """Queues of one and of two places, under random streams and at the default frames."""
-    streams = _streams(split)[: STREAMS[split] // 4]
-    found = [Cell(cell.label, cell.scenario, 1 + k % 2) for k, cell in enumerate(streams)]
-    return [*found, *_frames(split, (1, 2))]
+def _of_suite(suite: str, capacities: Sequence[int], label: str = "") -> Callable[..., list[Cell]]:
+    """Cells of a suite whose label has this in it, with messages of equal size and no limit on bytes."""
 
-
-def _of_suite(
-    suite: str, capacities: Sequence[int], label: str = "", equal: bool = True
-) -> Callable[[str], list[Cell]]:
-    """Cells of a suite whose label has this in it, without a limit on bytes."""
-
-    def made(split: str) -> list[Cell]:
-        found = {name: s for name, s in suites.get(suite).settings(split).items() if label in name}
+    def made(split: str, data: str | None = None) -> list[Cell]:
+        found = {name: s for name, s in suites.get(suite).settings(split, data).items() if label in name}
         kept = {name: s.scenario for name, s in found.items() if s.max_bytes is None}
-        chosen = {name: s for name, s in kept.items() if (getattr(s, "sizes", "equal") == "equal") == equal}
+        chosen = {name: _moved(s, split) for name, s in kept.items() if getattr(s, "sizes", "equal") == "equal"}
         return [Cell(name, scenario, L) for name, scenario in chosen.items() for L in capacities]
 
     return made
 
 
-FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
+def _moved(scenario: Any, split: str) -> Any:
+    """With many drives in place of a suite's few, where it trains: a network sees how its camera moves."""
+    is_made_up = all(motion.name.startswith("drive") for motion in getattr(scenario, "motion", ()))
+    if split != "train" or not getattr(scenario, "motion", ()) or not is_made_up:
+        return scenario
+    return replace(scenario, motion=frames_over(range(FIRST_SEED[split], FIRST_SEED[split] + FRAMES[split])).motion)
+
+
+FAMILIES: dict[str, Callable[..., list[Cell]]] = {
     "task": _task,
     "frames": _frames,
     "lte": _of_suite("lte-v2", (5, 8, 15)),
@@ -140,28 +143,18 @@ FAMILIES: dict[str, Callable[[str], list[Cell]]] = {
     "outage": _of_suite("outage-v1", (5, 15)),
     "heavy": _of_suite("jpeg-v1", (5, 10, 25), "heavy"),
     "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
-    "interruption": _of_suite("interruption-v1", (1, 2, 5, 8, 16, 32)),
-    "steady": _of_suite("sustained-v1", (1, 2, 3, 5, 8, 15, 32, 64)),
-    "random": functools.partial(_random, kind="random"),
-    "unequal": _of_suite("jpeg-v1", (5, 10, 25), equal=False),
-    "random-unequal": functools.partial(_random, kind="random-unequal", most=48),
-    "random-short": _short,
-    "random-plain": functools.partial(_random, kind="random-plain"),
+    "interruption": _of_suite("interruption-v1", (5, 8, 16, 32)),
+    "random": _random,
+    "uplinks": _uplinks,
 }
-"""Name -> cells of a split."""
-STAYING = ("interruption", "steady", "random-short", "random-plain", "unequal", "random-unequal")
-"""Families in which the clairvoyant teaches nothing: there the student learns to do what the rule gap-price does.
-
-For messages of unequal size there are no costs in hindsight. On steady links, in interruptions, in queues of one or two
-places and where V saturates, accepting is free in hindsight, as the clairvoyant could still drop the right messages
-later, and a student that accepts does not. ``random-plain`` has those among the random streams whose link is steady or
-whose V saturates.
-"""
+"""Name -> cells of a split, with a folder of recordings for ``uplinks``."""
 
 
-def runs_of(family: str, split: str, most: int) -> list[Run]:
+def runs_of(family: str, split: str, most: int, data: str | None = None) -> list[Run]:
     """So many runs of a family with their bounds: links and L take turns, and each run has a seed of its own."""
-    cells = [Cell(trace, part, c.capacity) for c in FAMILIES[family](split) for trace, part in by_trace(c.scenario)]
+    cells = [
+        Cell(trace, part, c.capacity) for c in FAMILIES[family](split, data) for trace, part in by_trace(c.scenario)
+    ]
     order = np.random.default_rng(0).permutation(len(cells))
     found = [(cells[order[k % len(cells)]], FIRST_EPISODE[split] + k) for k in range(most)]
     return [run_of(cell.label, cell.scenario, seed, cell.capacity) for cell, seed in found]

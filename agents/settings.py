@@ -82,6 +82,8 @@ class Settings(RunSettings):
     def __post_init__(self) -> None:
         if self.suites.suite and self.environment != type(self.environment)():
             raise BufgymError("--suite: it has environments of its own, so no setting of one (--env, --capacity, ...)")
+        if self.suites.data and self.kind == "environment":
+            raise BufgymError("--data is of suites and of the family uplinks")
         if self.kind not in self.kinds:
             known = ", ".join(each.algo for each in ALGORITHMS if self.kind in each.kinds) or "tune RULE --on SUITE"
             raise BufgymError(f"suite {self.suites.suite[0]}: {self.algo} learns none of this kind; these do: {known}")

@@ -46,15 +46,15 @@ class Suites:
     validation split, and report on its test split. Several, as in a,b: on all of them at once. A suite of a fleet
     (fleet-v1) makes an agent that all its robots share."""
     data: str | None = None
-    """Folder of recordings, for suites that need one."""
+    """Folder of recordings, for suites that need one, and for the family uplinks."""
     capacities: Capacities = ()
     """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
     test_seeds: TestSeeds = 0
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
 
     def __post_init__(self) -> None:
-        if not self.suite and any(vars(self).values()):
-            raise BufgymError("--data, --capacities and --test-seeds are of a suite, which --suite names")
+        if not self.suite and (self.capacities or self.test_seeds):
+            raise BufgymError("--capacities and --test-seeds are of a suite, which --suite names")
         if len(self.suite) > 1 and {"topics", "fleet"} & {suites.get(name).kind for name in self.suite}:
             raise BufgymError(
                 f"suite {','.join(self.suite)}: an agent for topics or a fleet learns from one suite alone"
@@ -72,23 +72,8 @@ class Suites:
         return self.capacities or suites.get(suite).capacities
 
 
-FAMILY_NAMES = (
-    "task",
-    "frames",
-    "lte",
-    "generated",
-    "outage",
-    "heavy",
-    "light",
-    "interruption",
-    "steady",
-    "random",
-    "unequal",
-    "random-unequal",
-    "random-short",
-    "random-plain",
-)
-ALL = "all"
+FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "random", "uplinks")
+ALL, RECORDED = "all", "uplinks"
 
 
 @dataclass(frozen=True)
@@ -98,17 +83,18 @@ class Families:
     kind: ClassVar[Kind] = "families"
     families: Names = ()
     """Train on these families of links and streams side by side instead (agents/ready_families.py), as in task,lte;
-    all: on all of them. What is best on their validation links is kept, and the report has their test links."""
+    all: on all of them, on uplinks if there is --data. What is best on
+    their validation links is kept, and the report has their test links."""
 
     def __post_init__(self) -> None:
         for name in self.families:
             if name not in (ALL, *FAMILY_NAMES):
                 raise unknown("family", name, (ALL, *FAMILY_NAMES))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The families, each once."""
-        return FAMILY_NAMES if ALL in self.families else tuple(dict.fromkeys(self.families))
+    def named(self, data: str | None) -> tuple[str, ...]:
+        """The families, each once; all are those that need no recordings, and with ``data`` the others."""
+        here = FAMILY_NAMES if data else tuple(name for name in FAMILY_NAMES if name != RECORDED)
+        return here if ALL in self.families else tuple(dict.fromkeys(self.families))
 
 
 @dataclass(frozen=True)

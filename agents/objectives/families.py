@@ -22,9 +22,9 @@ TEST_RUNS = 96
 
 
 @functools.lru_cache(maxsize=2)
-def _families(names: tuple[str, ...], split: str, runs: int) -> list[Family]:
+def _families(names: tuple[str, ...], split: str, runs: int, data: str | None) -> list[Family]:
     """Some runs of each family, with bounds that take seconds."""
-    return [Family(name, runs_of(name, split, runs)) for name in names]
+    return [Family(name, runs_of(name, split, runs, data)) for name in names]
 
 
 class FamiliesObjective(Objective):
@@ -35,14 +35,14 @@ class FamiliesObjective(Objective):
     def __init__(self, settings: Settings, folder: Path, seed: int) -> None:
         super().__init__(settings, folder, seed)
         assert isinstance(settings, Hindsight)
-        self.names = settings.sets.names
+        self.names, self.data = settings.sets.named(settings.suites.data), settings.suites.data
         self.columns = (*self.names, "mean")
         self.message = f"{{{len(self.names)}:.3f}} of AFR's regret on validation"
 
     @functools.cached_property
     def judges(self) -> list[Family]:
         """The validation runs of each family."""
-        return _families(self.names, "validation", -(-self.settings.validations() // len(self.names)))
+        return _families(self.names, "validation", -(-self.settings.validations() // len(self.names)), self.data)
 
     def validate(self, agent: Policy) -> tuple[float, ...]:
         """The share of AFR's regret on each family, and their mean."""
@@ -56,7 +56,7 @@ class FamiliesObjective(Objective):
         rivals = [policies.get(name) for name in RIVALS]
         lines = [["family", "runs", *(p.name for p in (*agents, *rivals)), *(f"best - {n} [95 %]" for n in RIVALS)]]
         chosen = [run.seed for run in trained.runs].index(trained.best.seed)
-        for family in _families(self.names, "test", TEST_RUNS):
+        for family in _families(self.names, "test", TEST_RUNS, self.data):
             found = family.against([*agents, *rivals])
             shares = [f"{share:.3f}" for share, _ in found]
             behind = [_text(interval) for interval in found[chosen][1][len(agents) :]]

@@ -31,6 +31,7 @@ from bufgym.model.observe import (
     observe_candidates,
 )
 from bufgym.model.past import CHANGED_US
+from bufgym.model.qoi import SATURATING
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
 from bufgym.policies.past_inputs import N_PAST, PAST_INPUTS, PAST_NAMES, past_inputs
@@ -46,7 +47,7 @@ from bufgym.policies.rule_inputs import (
     inputs,
     recall,
 )
-from bufgym.policies.target_gap import SEEN_US
+from bufgym.policies.target_gap import SEEN_US, bursty
 from bufgym.policies.thinning import steady
 
 NOT_OFFERED = -100
@@ -98,6 +99,20 @@ def even(buffer: Buffer, memory: Memory, remembers: bool) -> bool:
 
 
 @kernel
+def left_to_rule(buffer: Buffer, memory: Memory) -> bool:
+    """Whether the rule alone decides: what hindsight says there teaches nothing.
+
+    On an even link, in a queue of one or two places, in bursts, where V saturates and where sizes differ, accepting is
+    free in hindsight, as the clairvoyant could still drop the right messages later; who accepts does not.
+    """
+    rule, is_saturating = memory[RULE:], buffer.v[0] == SATURATING
+    is_short = buffer.capacity <= 2
+    return bool(
+        is_short or is_saturating or price_dp.share(rule, BASE) > 0 or bursty(rule) or even(buffer, memory, True)
+    )
+
+
+@kernel
 def look(
     buffer: Buffer, arrival: Arrival, memory: Memory, own: Memory, numbers: Singles, places: int, remembers: bool
 ) -> None:
@@ -122,7 +137,7 @@ def look(
         past_inputs(buffer, arrival, numbers[at : at + N_PAST])
         at += N_PAST
     decisions[actions - 1] = by_rule
-    alone = even(buffer, memory, remembers)
+    alone = left_to_rule(buffer, memory) if remembers else even(buffer, memory, False)
     for a in range(actions - 1):
         decisions[a], numbers[at + a] = NOT_OFFERED, 0.0
         if not alone and is_offered(order, True, room, a):
