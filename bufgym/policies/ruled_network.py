@@ -34,7 +34,7 @@ from bufgym.model.past import CHANGED_US
 from bufgym.model.qoi import SATURATING
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
-from bufgym.policies.past_inputs import N_PAST, PAST_INPUTS, PAST_NAMES, past_inputs
+from bufgym.policies.past_inputs import N_PAST, NOTHING, PAST_INPUTS, PAST_NAMES, past_inputs
 from bufgym.policies.registry import Arrival, Memory, Policy
 from bufgym.policies.rule_inputs import (
     BASE,
@@ -251,5 +251,5 @@ class RememberingWeights(RuledWeights):
     @staticmethod
     def definition(fields: Sequence[str]) -> list[Any]:
         """That of ``RuledWeights``, and of the past."""
-        past = [(field.name, field.unit, field.meaning) for field in PAST_INPUTS]
+        past = [(field.name, field.unit, field.meaning, NOTHING[field.name]) for field in PAST_INPUTS]
         return [*RuledWeights.definition(fields), past]

@@ -1,7 +1,7 @@
 """Slow, obvious reference model of what a robot remembers of its link and its camera: from lists of all that came.
 
-Written from the fields' meanings; it calls no kernel. Arguments are the arrivals so far, [(us, x)], the newest last, and
-``measured``: what ``naive.Sender`` measured at each of them.
+Written from the fields' meanings; it calls no kernel. Arguments are the arrivals so far, [(us, x)], the newest last,
+and ``measured``: what ``naive.Sender`` measured at each of them.
 """
 
 import math

@@ -16,7 +16,7 @@ from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import chains, price_dp, rule_inputs, target_gap, thinning, weights
-from bufgym.policies.past_inputs import PAST_NAMES
+from bufgym.policies.past_inputs import NOTHING
 from bufgym.policies.registry import Policy
 from bufgym.policies.ruled_network import (
     NOT_OFFERED,
@@ -61,7 +61,7 @@ def reference(made, margins):
         past = []
         if made.REMEMBERS:
             numbers = {f.name: f.function(buffer, arrival) for f in observe.ON_BOARD_FIELDS}
-            past = [4 * numbers[name] - 2 for name in PAST_NAMES]
+            past = [4 * (numbers[name] - nothing) for name, nothing in NOTHING.items()]
             is_even = numbers["since_change"] > 0.6  # 3 s beside 2 s
         if is_even and thinning.steady(buffer):
             does = [None for _ in does]

@@ -39,7 +39,7 @@ def correlation(buffer: Buffer) -> float:
     past = buffer.past
     if past[p.VARIANCE] < 1e-6:
         return 0.5
-    return 0.5 + 0.5 * min(max(past[p.COVARIANCE] / past[p.VARIANCE], -1.0), 1.0)
+    return float(0.5 + 0.5 * min(max(past[p.COVARIANCE] / past[p.VARIANCE], -1.0), 1.0))
 
 
 @kernel
