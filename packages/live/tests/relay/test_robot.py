@@ -256,6 +256,7 @@ SEEN = {
     "exact": True,
     "kinds": [["cdr", "std_msgs/msg/String"]],
     "heard": [str(k) for k in range(8)],
+    "unheard": ["nobody here subscribes to /unheard"],
     "location": {"x": 3.0, "y": 0.0, "yaw": 0.0, "frame": "map"},
     "goal": ["map", 1.5],
     "pose": ["map", -2.0],
