@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import ros_program
 from loop_cases import beside, compiled
 from needs import needs
 
@@ -107,6 +108,15 @@ async def test_two_relays_over_nats(rounds: int, tmp_path: Path, seed: int = 3) 
         field = await stack.enter_async_context(played(ports[1], ports[0], seed))
         field.shakes |= {"near relay": relays[0].again, "far relay": relays[1].again, "NATS": nats_again}
         await play(field, rounds, seed)
+
+
+@long
+@pytest.mark.parametrize("rounds", [2, pytest.param(100, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_a_robot_of_ros(version: str, rounds: int, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """Its process is ended and killed. What it executes is what another node hears of it."""
+    seen, _ = ros_program.run(request, "ros_restarts_session.py", version, tmp_path, rounds, rounds, limit_s=1150)
+    assert seen["rounds"] == rounds and seen["robot ended"] and seen["robot killed"] and seen["goals executed"]
 
 
 @needs_server
