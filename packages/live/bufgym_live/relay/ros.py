@@ -105,10 +105,16 @@ class _RosSource:
         return self._outlets[topic]
 
     async def _expect_stops(self) -> None:
-        """Find the readers of velocities before the first stop, which would wait for them; never return."""
+        """Find the readers of velocities before the first stop, which would wait for them; never return.
+
+        If a stop holds by then, say zeros: it may move at what this program said before it was killed, and a stop
+        that came before ROS was there has reached nobody.
+        """
         if TWIST.name in self._receive:
-            with suppress(BufgymError):  # the stop says it
+            with suppress(BufgymError):  # the next stop says it
                 await self._outlet(TWIST)
+                if self._is_stopped():
+                    await self.on_command({"command": "stop"})
         await asyncio.Event().wait()
 
     def status(self) -> dict[str, Any]:
