@@ -67,8 +67,8 @@ class Body:
 
     async def on_command(self, command: Any) -> None:
         stands = self.robot is not None and self.robot.latch.is_set
-        if command["command"] == "drive":
-            self._truth.moved(command["linear"], stands)
+        if command["command"] in ("drive", "stop"):
+            self._truth.moved(command.get("linear", 0.0), stands)
         if command["command"] != "goal":
             return
         self._truth.began(command["id"], time.monotonic(), stands)

@@ -22,6 +22,8 @@ from bufgym.utils.errors import BufgymError
 from bufgym_live.relay.orders import heard_stops
 from bufgym_live.relay.session import Session
 
+STANDS_S = 20.0
+"""Time in which a robot that holds a stop stands, once all have met."""
 Make = Callable[[Truth, random.Random, str], Played]
 """Makes the robot, which connects to this address."""
 
@@ -198,6 +200,11 @@ class Field:
         self._waiting.clear()
         await self._agree()
         held = self._robot.held()
+        until_s = time.monotonic() + STANDS_S
+        while held and self.truth.linear and time.monotonic() < until_s:
+            await asyncio.sleep(0.01)
+        if held and self.truth.linear:
+            self.truth.wrong.append(f"moves on at {self.truth.linear}, while stops hold: {held}")
         lost = [id for id in self.truth.standing() if not covers(held, id)]
         self.truth.wrong += [f"lost: stop {id}" for id in lost]
         over = [id for id, said in self.truth.stops.items() if said.released_s is not None]

@@ -41,6 +41,8 @@ class Truth:
     done: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
+    linear: float = 0.0
+    """The last velocity ahead, at which the robot moves until it hears another, whatever happens to its client."""
 
     def covered(self, ids: list[str]) -> list[Said]:
         """The stops that a release of these covers."""
@@ -65,6 +67,7 @@ class Truth:
 
     def moved(self, linear: float, stands: bool) -> None:
         """Take note of a velocity ahead."""
+        self.linear = linear
         self.counts["velocities" if linear else "zeros"] += 1
         if linear and stands:
             self.wrong.append(f"velocity {linear} while a stop holds at the robot")
