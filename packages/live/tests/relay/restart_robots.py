@@ -19,8 +19,11 @@ class Running:
         self._task = asyncio.create_task(work)
 
     async def end(self) -> None:
+        """End it; raise what it ended with before, if it did."""
         self._task.cancel()
         await asyncio.wait([self._task])
+        if not self._task.cancelled():
+            self._task.result()
 
 
 class Played(Protocol):

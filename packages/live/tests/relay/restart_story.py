@@ -109,7 +109,10 @@ class Field:
             confirmed |= self._robot.confirmed().union(*(watch.robot or () for watch in self.watches))
             for id in self.truth.standing():
                 if id in confirmed and not covers(held, id):
-                    self.truth.wrong.append(f"lost: stop {id} at the robot")
+                    said = [(watch.relay, watch.robot) for watch in self.watches]
+                    self.truth.wrong.append(
+                        f"lost: stop {id} at the robot, which holds {held}; relay and status: {said}"
+                    )
                     confirmed.discard(id)
             await asyncio.sleep(0.005)
 

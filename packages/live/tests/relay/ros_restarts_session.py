@@ -49,7 +49,6 @@ class Process:
         self._words, self._file, self._truth = words, place(urlsplit(url).netloc, "r"), truth
         self._held: dict[str, float] = {}
         """Stop in the file -> when it was first seen there."""
-        self._changed: tuple[int, int] | None = None
         self._since_s = 0.0
         self.restarts = {
             "robot ended": partial(self._again, signal.SIGTERM),
@@ -103,11 +102,9 @@ class Process:
         return status_s > self._since_s
 
     def held(self) -> list[str]:
-        if self._file.exists() and (now := stamp(self._file)) != self._changed:
-            stops = read(json.loads(self._file.read_bytes())["stops"])
-            seen_s = time.monotonic()
+        if self._file.exists():
+            stops, seen_s = read(json.loads(self._file.read_bytes())["stops"]), time.monotonic()
             self._held = {stop.id: self._held.get(stop.id, seen_s) for stop in stops if stop.holds}
-            self._changed = now  # as it was before it was read: if it has changed since, it is read again
         return sorted(self._held)
 
     def confirmed(self) -> set[str]:
@@ -117,12 +114,6 @@ class Process:
     async def send(self, operator: Session, id: str) -> None:
         pose = message(POSE, 0, int(id[1:]) / UNIT, "map")
         await operator.command("/robots/r/to/goal_pose", pose, POSE)
-
-
-def stamp(file: Path) -> tuple[int, int]:
-    """What tells a file that was replaced from the one before."""
-    now = file.stat()
-    return now.st_ino, now.st_mtime_ns
 
 
 def void(_: object) -> None:
