@@ -56,7 +56,7 @@ def corner(server: Any) -> Any:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """The module's browser."""
-    from page_cases import browsing
+    from browser_cases import browsing
 
     with browsing() as one:
         yield one
