@@ -41,6 +41,7 @@ class Truth:
     done: Counter[str] = field(default_factory=Counter)
     counts: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
+    late_s: float = LATE_S
     linear: float = 0.0
     """The last velocity ahead, at which the robot moves until it hears another, whatever happens to its client."""
 
@@ -59,7 +60,7 @@ class Truth:
         if (goal := self.goals.get(id)) is None:
             self.wrong.append(f"late: goal {id}, of a round that was over")
             return
-        if at_s - goal.sent_s > LATE_S:
+        if at_s - goal.sent_s > self.late_s:
             self.wrong.append(f"late: goal {id} after {at_s - goal.sent_s:.2f} s")
         for stop, said in self.stops.items():
             if said.returned_s <= goal.sent_s and (said.begun_s is None or said.begun_s > at_s):

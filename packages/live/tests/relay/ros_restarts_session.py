@@ -20,7 +20,7 @@ import pytest
 from pose_cases import POSE, message
 from relay_cases import settings, wait
 from restart_cases import RULE, begun, play, played
-from restart_truth import Truth, covers
+from restart_truth import DEADLINE_S, Truth, covers
 from ros_cuts_session import QUICK
 from ros_session import CONFIG, node_1, node_2
 
@@ -30,7 +30,7 @@ from bufgym_live.relay.ledger import read
 from bufgym_live.relay.session import Session
 from bufgym_live.robot.sockets import free_port
 
-SLOW_S = 0.5
+SLOW_S = 1.5
 """Longest way of a message through ROS to the node, on a busy machine."""
 UNIT = 1024
 """Goal number k has x = k / 1024, which is exact."""
@@ -50,6 +50,7 @@ class Process:
         self._held: dict[str, float] = {}
         """Stop in the file -> when it was first seen there."""
         self._since_s = 0.0
+        truth.late_s = DEADLINE_S + SLOW_S
         self.restarts = {
             "robot ended": partial(self._again, signal.SIGTERM),
             "robot killed": partial(self._again, signal.SIGKILL),
