@@ -8,7 +8,7 @@ from link_files import SAMPLES, knots, written
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
-from bufgym.traces import Columns, PoseColumns, read_motion, read_trace, read_workload
+from bufgym.traces import Columns, read_motion, read_trace, read_workload
 from bufgym.traces.formats.trajectories import read_poses
 from bufgym.utils.errors import TraceError, TraceWarning
 
@@ -93,8 +93,8 @@ TABLES = {
     "stamp [ms];id;px;py;pz\n0;a;0,0;0;0\n1000;b;3,0;0;0\n2000;c;9,0;0;0\n": None,
     "Date,X,Y,Z,QX,QY,QZ,QW\n"
     + "".join(f"2024-01-31T12:00:0{k},{x},0,0,0,0,0,1\n" for k, x in ((0, 0), (1, 3), (2, 9))): None,
-    "a b c\n0 0 5\n0 1000 8\n0 2000 14\n": PoseColumns("b", ("c", "a"), "ms"),
-    "0 0 5\n0 1 8\n0 2 14\n": PoseColumns("2", ("3", "1", "1")),
+    "a b c\n0 0 5\n0 1000 8\n0 2000 14\n": Columns("b", pose=("c", "a"), time_unit="ms"),
+    "0 0 5\n0 1 8\n0 2 14\n": Columns("2", pose=("3", "1", "1")),
     "# id time x y z qx qy qz qw\n7 0 0 0 0 0 0 0 1\n7 1 3 0 0 0 0 0 1\n7 2 9 0 0 0 0 0 1\n": None,
 }
 
@@ -109,10 +109,10 @@ def test_poses_of_any_table(tmp_path: Path, text: str) -> None:
 def test_what_a_table_of_poses_lacks_is_said(tmp_path: Path) -> None:
     path = written(tmp_path, "t,x,y\n0,1,2\n1,1,2,3\n", "poses.csv")
     refuse("line 3: .*must have 3 columns, has 4", read_motion, path)
-    refuse("has no column 'w': must be one of t, x, y", read_motion, path, columns=PoseColumns("t", ("x", "w")))
-    refuse("must be x y, x y z, or", read_motion, path, columns=PoseColumns("t", ("x",)))
-    refuse("time_unit = 'h'", read_motion, path, columns=PoseColumns("t", ("x", "y"), "h"))
-    refuse("go without format and times", read_motion, path, columns=PoseColumns("t", ("x", "y")), format="tum")
+    refuse("has no column 'w': must be one of t, x, y", read_motion, path, columns=Columns("t", pose=("x", "w")))
+    refuse("must be x y, x y z, or", read_motion, path, columns=Columns("t", pose=("x",)))
+    refuse("time_unit = 'h'", read_motion, path, columns=Columns("t", pose=("x", "y"), time_unit="h"))
+    refuse("go without format and times", read_motion, path, columns=Columns("t", pose=("x", "y")), format="tum")
     nine = written(tmp_path, "0 0 0 0 0 0 0 1 5\n1 0 0 0 0 0 0 1 5\n", "nine.txt")
     refuse("must have 8 columns.*has 9: name them with --time COL --pose", read_motion, nine)
     norm = written(tmp_path, "t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,2\n1,0,0,0,0,0,0,1\n", "norm.csv")

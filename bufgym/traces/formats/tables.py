@@ -4,14 +4,17 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final
+from itertools import takewhile
+from typing import Final, NamedTuple
+
+import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.intervals import MAX_MBIT_PER_S, Knots, Rate, held_rates
 from bufgym.traces.formats.recipes import field_of, unit_named
 from bufgym.traces.formats.text import NUMBER, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S
-from bufgym.traces.trace import US_PER_S
+from bufgym.traces.trace import US_PER_S, Float64Array
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.units import RATES
 
@@ -20,6 +23,7 @@ NAMED: Final = "--time COL --rate COL --unit kB/s (read_trace(columns=Columns(..
 _RATE_NAMES: Final = {name.lower() for name in RATES}
 
 _MAX_EPOCH_S: Final = 10**10
+_ROWS: Final = 1000  # Lines by which a table is known
 
 
 @dataclass(frozen=True)
@@ -27,11 +31,57 @@ class Columns:
     """Which columns of a table hold what: each by its name in the header, or by its number from 1."""
 
     time: str
-    rate: str
+    rate: str = ""
     unit: str = "bit/s"
     """Of the rate: B/s, kB/s, Mbit/s, ..."""
     time_unit: str = ""
-    """s, ms, us or ns; by default that in the time's name, else s."""
+    """s, ms, us or ns; by default that in the time's name, else s, or by the steps of poses."""
+    pose: tuple[str, ...] = ()
+    """x, y[, z[, qx, qy, qz, qw]], or latitude, longitude[, altitude]."""
+
+
+class Head(NamedTuple):
+    """The first lines of a table."""
+
+    first: Line | None  # that is no remark
+    remarks: list[str]  # above it
+    header: Line | None  # the last line above the first with a number; it may be a remark
+    names: list[str]  # of the columns, by the header; none where they are not as many
+    rows: list[tuple[Line, list[str]]]  # with as many cells as the first with a number
+
+    @property
+    def separator(self) -> str:
+        """What stands between the cells of a line."""
+        return separator_of(self.rows[0][0].text)
+
+    def numbers(self, place: int) -> tuple[Float64Array, int]:
+        """The numbers of a column until the first cell that is none, and how many decimals they have at most."""
+        cells = list(takewhile(is_number, (cells[place] for _, cells in self.rows)))
+        return np.array(cells, np.float64), max((len(cell.partition(".")[2]) for cell in cells), default=0)
+
+
+def head_of(path: StrPath) -> Head:
+    """The first lines of a file."""
+    first, header, remarks, names, rows = None, None, list[str](), list[str](), list[tuple[Line, list[str]]]()
+    with open_text(path) as file:
+        for line in file.lines():
+            is_remark = line.text.startswith("#")
+            cells = cells_of(line.text.lstrip("#"), separator_of(line.text))
+            if first is None:
+                remarks += [line.text] * is_remark
+                first = None if is_remark else line
+            if not rows and (is_remark or not any(map(is_number, cells))):
+                header, names = line, cells
+            elif not is_remark and (not rows or len(cells) == len(rows[0][1])):
+                rows.append((line, cells))
+            if len(rows) == _ROWS:
+                break
+    return Head(first, remarks, header, names if rows and len(names) == len(rows[0][1]) else [], rows)
+
+
+def is_number(text: str) -> bool:
+    """Whether a cell is a plain number."""
+    return re.fullmatch(NUMBER, text) is not None
 
 
 def read_mbit(path: StrPath) -> Knots:
@@ -88,7 +138,7 @@ def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[
             count = len(header)
             places = [place_of(line, header, name) for name in wanted]
             names = [header[k] for k in places]
-            if not all(re.fullmatch(NUMBER, header[k]) or date_us(header[k]) for k in places):
+            if not all(is_number(header[k]) or date_us(header[k]) for k in places):
                 continue
         if line.text.startswith("#"):
             continue
