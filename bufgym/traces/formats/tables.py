@@ -38,6 +38,15 @@ class Columns:
     """s, ms, us or ns; by default that in the time's name, else s, or by the steps of poses."""
     pose: tuple[str, ...] = ()
     """x, y[, z[, qx, qy, qz, qw]], or latitude, longitude[, altitude]."""
+    bytes: str = ""
+    """Of messages, with their topic or without."""
+    topic: str = ""
+
+    def named(self, *fields: str) -> dict[str, str]:
+        """The columns of those of these fields that are chosen, which the first two must be."""
+        if missing := [field for field in fields[:2] if not getattr(self, field)]:
+            raise BufgymError(f"columns must name {' and '.join(missing)}")
+        return {field: getattr(self, field) for field in fields if getattr(self, field)}
 
 
 class Head(NamedTuple):
@@ -105,7 +114,7 @@ def read_rates(path: StrPath) -> Knots:
     """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
     with open_text(path) as file:
         header, _ = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-    columns = _columns_named(header)
+    columns = _columns_named(header.text)
     assert columns is not None
     return read_table(path, columns)
 
@@ -115,17 +124,13 @@ def read_table(path: StrPath, columns: Columns) -> Knots:
     if columns.unit not in RATES:
         rule = "b is a bit and B a byte: must be as Mbps or MBps"
         raise fault(path, rule, value=columns.unit, field="unit of the rate")
-    if columns.time_unit not in ("", *UNIT_S):
-        raise BufgymError(f"time_unit = {columns.time_unit!r}: must be one of {', '.join(UNIT_S)}")
     with open_text(path) as file:
         return held_rates(path, _table_rates(file.lines(), columns, RATES[columns.unit] / US_PER_S))
 
 
 def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
     for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
-        # A column named time_s may hold anything.
-        named = columns.time_unit or unit_named(names[0]).removesuffix("s" if names[0] == "time_s" else "?")
-        yield _rate(line, time, rate, columns.unit, unit, named)
+        yield _rate(line, time, rate, columns.unit, unit, time_unit(columns, names[0]))
 
 
 def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
@@ -142,10 +147,19 @@ def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[
                 continue
         if line.text.startswith("#"):
             continue
-        cells = cells_of(line.text, separator)
+        cells = cells_of(line.text, separator, count)
         if len(cells) != count:
             raise line.misfit(f"must have {count} columns, has {len(cells)}")
         yield line, [cells[k] for k in places], names
+
+
+def time_unit(columns: Columns | None, name: str) -> str:
+    """The unit of times as chosen, or as their column's name ends with it; empty where neither says it."""
+    unit = columns.time_unit if columns else ""
+    if unit not in ("", *UNIT_S):
+        raise BufgymError(f"time_unit = {unit!r}: must be one of {', '.join(UNIT_S)}")
+    # A column named time_s may hold anything.
+    return unit or unit_named(name).removesuffix("s" if name == "time_s" else "?")
 
 
 def separator_of(text: str) -> str:
@@ -153,12 +167,15 @@ def separator_of(text: str) -> str:
     return next((mark for mark in ";,\t" if mark in text), "")
 
 
-def cells_of(text: str, separator: str) -> list[str]:
-    """The cells of a line, without quotes; between semicolons, commas are decimal points."""
+def cells_of(text: str, separator: str, count: int = 1) -> list[str]:
+    """The cells of a line, without quotes; between semicolons, commas are decimal points.
+
+    A separator at the end begins no cell beyond ``count``.
+    """
     if separator == ";":
         text = text.replace(",", ".")  # decimal commas
     cells = [cell.strip().strip('"') for cell in text.split(separator or None)]
-    return cells[:-1] if separator and len(cells) > 1 and not cells[-1] else cells
+    return cells[:-1] if separator and len(cells) > count and not cells[-1] else cells
 
 
 def place_of(line: Line, header: list[str], name: str) -> int:

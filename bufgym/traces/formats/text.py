@@ -157,12 +157,8 @@ class TextFile:
 
     def lines(self) -> Iterator[Line]:
         """The lines that are not blank, numbered from 1, without surrounding white space."""
-        for number, raw in self._raw_lines():
-            line = _parsed_line(self.path, number, raw)
-            if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
-                raise _too_long(line)
-            if line.text:
-                yield line
+        for number, block in self.blocks():
+            yield from self.block_lines(number, block)
 
     def blocks(self) -> Iterator[tuple[int, bytes]]:
         """All lines in blocks of some MB, each with the number of its first line; see `block_lines`."""
@@ -191,7 +187,7 @@ class TextFile:
         if number > MAX_LINES:
             raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=number)
 
-    def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[str, Iterator[Line]]:
+    def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[Line, Iterator[Line]]:
         """The first line, which must be that ``header`` (in words), and the lines below it."""
         lines = self.lines()
         first = next(lines, None)
@@ -199,7 +195,7 @@ class TextFile:
             raise fault(self.path, f"is empty: must begin with {header}")
         if not fits(first.text):
             raise first.misfit(f"must be {header}")
-        return first.text, lines
+        return first, lines
 
     def first(self) -> Line | None:
         """The first line that is not blank, None in an empty file.

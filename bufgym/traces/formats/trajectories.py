@@ -23,9 +23,9 @@ import numpy as np
 
 from bufgym.traces.formats.faults import StrPath, fault
 from bufgym.traces.formats.geodesy import local_plane
-from bufgym.traces.formats.recipes import Recipe, field_of, recipes, unit_named
+from bufgym.traces.formats.recipes import Recipe, field_of, recipes
 from bufgym.traces.formats.rows import BlockReader, RowReader, Rows, read_rows
-from bufgym.traces.formats.tables import Columns, Head, cells_of, date_us, head_of, place_of
+from bufgym.traces.formats.tables import Columns, Head, cells_of, date_us, head_of, place_of, time_unit
 from bufgym.traces.formats.text import MAX_LINE_CHARACTERS, Line, open_text, split_cells
 from bufgym.traces.formats.units import UNIT_S, unit_of, warn_of_unit
 from bufgym.traces.plausible import check_slow_poses, warn_of_jumps
@@ -152,9 +152,7 @@ def _of_table(
     places = _chosen(line, names or [str(k + 1) for k in range(len(cells))], columns) if columns else _by_names(names)
     if not places:
         return None
-    unit = (columns.time_unit if columns else "") or unit_named(names[places["time"]] if names else "")
-    if unit and unit not in UNIT_S:
-        raise BufgymError(f"time_unit = {unit!r}: must be one of {', '.join(UNIT_S)}")
+    unit = time_unit(columns, names[places["time"]] if names else "")
     times, decimals = head.numbers(places["time"])
     if len(times):
         found = unit or unit_of(path, times, "s", decimals)
