@@ -58,11 +58,11 @@ def read_workload_csv(path: StrPath, columns: Columns | None = None) -> Workload
                 xs.append(coordinate(line, "x", texts["x"], xs[-1] if xs else 0.0))
     if not times:
         raise fault(path, "holds no message: must hold at least one")
+    arrival_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
     with heard() as doubts:
         if whole:
             plausible.check_seconds(path, np.asarray(times) / US_PER_S, refuse_ms=True)
-        plausible.warn_of_pauses(path, np.asarray(times) - times[0])
-    arrival_us, size, number = (np.array(column, np.int64) for column in (times, sizes, numbers))
+        plausible.warn_of_pauses(path, arrival_us - times[0], number, list(topics))
     x_from_0 = np.array(xs, np.float64) - xs[0] if xs else None
     source = f"{path} ({','.join(wanted.values() if columns else split_cells(first.text))})"
     sheet = Sheet(time_facts("messages", arrival_us - times[0], times[0]), tuple(doubts))
