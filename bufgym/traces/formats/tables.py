@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -93,44 +93,41 @@ def is_number(text: str) -> bool:
     return re.fullmatch(NUMBER, text) is not None
 
 
-def read_mbit(path: StrPath) -> Knots:
-    """Seconds, since any time, and Mbit/s separated by white space, by the rules of `held_rates`."""
-    return read_table(path, Columns("1", "2", "Mbit/s"))
-
-
-def fits_rates(text: str) -> bool:
-    """Whether a header names one time and one rate, as `time_s,bytes_per_s` and `time,mbps` do."""
-    return _columns_named(text) is not None
-
-
-def _columns_named(text: str) -> Columns | None:
+def fits_rates(text: str) -> Columns | None:
+    """The columns of a header that names one time and one rate, as `time_s,bytes_per_s` and `time,mbps` do."""
     names = split_cells(text)
     times = [name for name in names if field_of(name) == "time"]
     rates = [name for name in names if name.lower() in _RATE_NAMES]
     return Columns(times[0], rates[0], rates[0]) if len(times) == len(rates) == 1 else None
 
 
-def read_rates(path: StrPath) -> Knots:
-    """Times in seconds or as ISO dates, and rates, under a header that `fits_rates`, by the rules of `held_rates`."""
+def read_table(path: StrPath, columns: Columns | None = None) -> Knots:
+    """Times and rates by the rules of `held_rates`, in columns that are chosen or that a header names (`fits_rates`).
+
+    Cells lie between commas, semicolons or blanks; times are numbers or ISO dates.
+    """
     with open_text(path) as file:
-        header, _ = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits_rates)
-    columns = _columns_named(header.text)
-    assert columns is not None
-    return read_table(path, columns)
+        fits = fits_rates if columns is None else bool
+        first, lines = file.below_header(f"the header {RATES_HEADER} or time,mbps", fits)
+        columns = columns or fits_rates(first.text)
+        assert columns is not None
+        if columns.unit not in RATES:
+            rule = "b is a bit and B a byte: must be as Mbps or MBps"
+            raise fault(path, rule, value=columns.unit, field="unit of the rate")
+        return held_rates(path, _rates(chain([first], lines), columns, RATES[columns.unit] / US_PER_S))
 
 
-def read_table(path: StrPath, columns: Columns) -> Knots:
-    """A table whose columns are named, by the rules of `held_rates`; cells lie between commas, semicolons or blanks."""
-    if columns.unit not in RATES:
-        rule = "b is a bit and B a byte: must be as Mbps or MBps"
-        raise fault(path, rule, value=columns.unit, field="unit of the rate")
-    with open_text(path) as file:
-        return held_rates(path, _table_rates(file.lines(), columns, RATES[columns.unit] / US_PER_S))
-
-
-def _table_rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
-    for line, (time, rate), names in table_cells(lines, (columns.time, columns.rate)):
-        yield _rate(line, time, rate, columns.unit, unit, time_unit(columns, names[0]))
+def _rates(lines: Iterator[Line], columns: Columns, unit: float) -> Iterator[Rate]:
+    """The rate of each line; ``unit`` is bytes per microsecond of theirs."""
+    for line, (time, rate), names in table_cells(lines, list(columns.named("time", "rate").values())):
+        named, start_us = time_unit(columns, names[0]), date_us(time)
+        if start_us is None:
+            unit_s = UNIT_S[named or "s"]
+            start_us = round(
+                line.decimal(f"time in {named or 's'}", time, 0, _MAX_EPOCH_S / unit_s) * unit_s * US_PER_S
+            )
+        value = line.decimal(columns.unit, rate, 0, MAX_MBIT_PER_S * 0.125 / unit)
+        yield Rate(line, time, start_us, value * unit, named)
 
 
 def table_cells(lines: Iterator[Line], wanted: Sequence[str]) -> Iterator[tuple[Line, list[str], list[str]]]:
@@ -185,17 +182,6 @@ def place_of(line: Line, header: list[str], name: str) -> int:
     if name in header:
         return header.index(name)
     raise line.error(None, f"has no column {name!r}: must be one of {', '.join(header)[:300]}, or a number from 1")
-
-
-def _rate(line: Line, time: str, rate: str, field: str, unit: float, time_unit: str = "") -> Rate:
-    """The rate that a line states; ``unit`` is bytes per microsecond of the field's unit."""
-    start_us = date_us(time)
-    if start_us is None:
-        unit_s = UNIT_S[time_unit or "s"]
-        start_us = round(
-            line.decimal(f"time in {time_unit or 's'}", time, 0, _MAX_EPOCH_S / unit_s) * unit_s * US_PER_S
-        )
-    return Rate(line, time, start_us, line.decimal(field, rate, 0, MAX_MBIT_PER_S * 0.125 / unit) * unit, time_unit)
 
 
 def date_us(text: str) -> int | None:

@@ -42,7 +42,7 @@ MAX_EPOCH_S: Final = 1e11
 _EUROC_HEADER: Final = re.compile(r"#\s*timestamp\s*\[(s|ms|us|ns)\]")
 # State estimates continue with the velocity, those of EuRoC's own CSV files also with biases.
 _COLUMNS: Final = {"tum": (8,), "euroc": (8, 11, 17)}
-_MOST: Final = {"latitude": 90.0, "longitude": 180.0, "altitude": 1e5}
+MOST_OF_FIX: Final = {"latitude": 90.0, "longitude": 180.0, "altitude": 1e5}
 _NO_TURN: Final = [0.0, 0.0, 0.0, 1.0]
 _NAMES: Final = {
     "tum": ("time", "tx", "ty", "tz", "qx", "qy", "qz", "qw"),
@@ -194,7 +194,7 @@ def _recipe_row(recipe: Recipe) -> RowReader:
         if groups is None:
             return None
         place = []
-        for field, most in _MOST.items():
+        for field, most in MOST_OF_FIX.items():
             text, value = groups.get(f"{field}_dm"), float(groups.get(field) or 0)
             if text:  # degrees and two digits of minutes before the point
                 at = text.index(".") - 2
@@ -242,7 +242,7 @@ def pose_row(places: dict[str, int], columns: Sequence[int], unit: str, separato
         text, values = cells[places["time"]], list[float]()
         date = None if separator is None else date_us(text)
         for field in place:
-            most = _MOST.get(field, MAX_POSITION_M)
+            most = MOST_OF_FIX.get(field, MAX_POSITION_M)
             values.append(line.decimal(field, cells[places[field]], -most, most))
         values += [0.0] * (3 - len(values))
         quaternion = [line.decimal(field, cells[places[field]], -MAX_POSITION_M, MAX_POSITION_M) for field in turn]
