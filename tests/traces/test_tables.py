@@ -4,13 +4,14 @@ import warnings
 from pathlib import Path
 
 import pytest
+from cli_cases import shown
 from link_files import SAMPLES, knots, written
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
 from bufgym.traces import Columns, read_motion, read_trace, read_workload
 from bufgym.traces.formats.trajectories import read_poses
-from bufgym.utils.errors import TraceError, TraceWarning
+from bufgym.utils.errors import BufgymError, TraceError, TraceWarning
 
 S = 1_000_000
 
@@ -152,3 +153,21 @@ def test_receivers_of_satellites(tmp_path: Path) -> None:
             poses = read_poses(written(tmp_path, text, "gps.txt"))
         assert poses.time_us.tolist() == [0, 2_000_000] and "no orientation" in poses.format
         assert poses.position_m[1] == pytest.approx([0, 111.13, 0], abs=0.02)
+
+
+def test_messages_of_any_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """100 bytes on /x, 50 ms later 200 on /y, another 50 ms later 100 on /x."""
+    path = written(tmp_path, "a;when [ms];n;ch\n1;0;100;/x\n2;50;200;/y\n3;100;100;/x\n", "any.txt")
+    columns = Columns("when [ms]", bytes="n", topic="ch")
+    workload = read_workload(path, columns=columns)
+    assert workload.arrival_us.tolist() == [0, 50_000, 100_000]
+    assert workload.size_bytes.tolist() == [100, 200, 100]
+    assert [workload.topic_of(k) for k in range(3)] == ["/x", "/y", "/x"]
+    refuse("columns must name bytes", read_workload, path, columns=Columns("a"), kind=BufgymError)
+    refuse("line 1: has no column 'size'", read_workload, path, columns=Columns("a", bytes="size"))
+    recording = ODD_FILES / "good.mcap"
+    refuse("of a table, which a recording is not", read_workload, recording, columns=columns, kind=BufgymError)
+    played = ["bench", "--workload", str(path), "--trace", "4Mbit/s", "--policies", "afr", "--capacity", "3"]
+    assert "3 messages, 400 bytes in 0.100 s" in shown(
+        [*played, "--columns", "2", "n", "ch", "--time-unit", "ms"], capsys
+    )

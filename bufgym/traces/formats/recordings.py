@@ -14,6 +14,7 @@ from bufgym.traces.formats import bags
 from bufgym.traces.formats.faults import StrPath, heard, warn
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.splits import is_recording
+from bufgym.traces.formats.tables import Columns
 from bufgym.traces.formats.workloads import read_workload_csv
 from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
@@ -31,6 +32,7 @@ def read_workload(
     settings: MotionSettings | None = None,
     bridge_gaps: bool = False,
     clock: str = "log",
+    columns: Columns | None = None,
     advance: Callable[[int], object] = int,
 ) -> Workload:
     """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
@@ -43,6 +45,7 @@ def read_workload(
         bridge_gaps: take motion across a gap as the straight way from its first pose to its last (before the first
             pose and after the last: none); otherwise a gap is an error.
         clock: the clock of a recording's arrivals (see `bags.read_bag`).
+        columns: of any other table, which columns hold times, bytes and topics.
         advance: called with 1 for each message of a recording read, as a progress bar's update.
     """
     if not isinstance(path, str | PathLike) and len(path) == 1:
@@ -50,7 +53,9 @@ def read_workload(
     if isinstance(path, str | PathLike) and not is_recording(path):
         if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
-        return _with_topics(read_workload_csv(path), topics)
+        return _with_topics(read_workload_csv(path, columns), topics)
+    if columns is not None:
+        raise BufgymError(f"{path}: columns are of a table, which a recording is not")
     bag = bags.read_bag(path, odom, advance, clock)
     return workload_from_bag(bag, topics=topics, settings=settings, bridge_gaps=bridge_gaps)
 

@@ -25,7 +25,7 @@ from bufgym.traces.workload import MAX_MESSAGE_BYTES, Workload
 from bufgym.utils.errors import BufgymError
 
 WORKLOAD_HEADERS: Final = ("time_s,bytes", "time_s,bytes,topic", "time_s,bytes,x", "time_s,bytes,topic,x")
-_HEADER: Final = "the header time_s,bytes[,topic][,x], or name a time and bytes (or say --time COL --bytes COL)"
+_HEADER: Final = "the header time_s,bytes[,topic][,x], or name a time and bytes (or say --columns TIME BYTES)"
 
 
 def read_workload_csv(path: StrPath, columns: Columns | None = None) -> Workload:
