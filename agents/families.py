@@ -7,7 +7,8 @@ ratios.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,53 +16,33 @@ from numpy.typing import NDArray
 
 from agents.evaluation import Numbers, qoi_of
 from bufgym import policies
-from bufgym.benchmark.bootstrap import RESAMPLES, Interval, interval, times_drawn
-from bufgym.benchmark.tasks import QueueTask
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, Interval, interval, times_drawn
+from bufgym.oracle import clairvoyant
 from bufgym.policies import Policy
-from bufgym.scenario import suites
-from bufgym.scenario.numbered import by_trace, draw
+from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 
 LEAST, MOST = 0.01, 4.0
 """Added to both regrets in a ratio of single runs, and the largest ratio."""
 Run = dict[str, Any]
-"""``link``, ``episode``, ``capacity``, ``max_bytes``, ``value``, and ``best``, the clairvoyant's H."""
+"""``link``, ``scenario``, ``episode``, ``capacity``, ``max_bytes``, ``value``, and ``best``, the clairvoyant's H."""
+
+
+def drawn_run(link: str, scenario: Any, seed: int, capacity: int, max_bytes: int | None = None) -> Run:
+    """One run without its bound, which takes longer than the run itself."""
+    known = {"link": link, "scenario": scenario, "capacity": capacity, "max_bytes": max_bytes}
+    return {**known, "episode": draw(scenario, seed), "value": scenario.value, "best": math.nan}
+
+
+def bound_of(run: Run) -> float:
+    """The clairvoyant's H, or with unequal sizes a bound above it."""
+    return clairvoyant(run["episode"], run["capacity"], run["value"], max_bytes=run["max_bytes"]).qoi
 
 
 def run_of(link: str, scenario: Any, seed: int, capacity: int, max_bytes: int | None = None) -> Run:
     """One run, with its bound."""
-    episode = draw(scenario, seed)
-    most = QueueTask(max_bytes=max_bytes).best(episode, capacity, scenario).qoi
-    known = {"link": link, "episode": episode, "capacity": capacity, "max_bytes": max_bytes}
-    return {**known, "value": scenario.value, "best": most}
-
-
-def of_suite(
-    name: str,
-    split: str,
-    capacities: Sequence[int] = (),
-    seeds: int = 1,
-    every: int = 1,
-    data: str | None = None,
-    chosen: Callable[[str], bool] = lambda label: True,
-) -> dict[str, list[Run]]:
-    """The runs of a suite's scenarios by label, on every so many of its links; ``data``: folder of recordings."""
-    suite, found = suites.get(name), {}
-    for label, setting in suite.settings(split, data).items():
-        if not chosen(label):
-            continue
-        found[label] = [
-            run_of(trace, scenario, seed, L, setting.max_bytes)
-            for trace, scenario in by_trace(setting.scenario)[::every]
-            for seed in range(seeds)
-            for L in capacities or setting.capacities or suite.capacities
-        ]
-    return found
-
-
-def merged(found: dict[str, list[Run]]) -> list[Run]:
-    """The runs of all labels."""
-    return [run for runs in found.values() for run in runs]
+    run = drawn_run(link, scenario, seed, capacity, max_bytes)
+    return {**run, "best": bound_of(run)}
 
 
 class Family:
@@ -70,8 +51,9 @@ class Family:
     def __init__(self, name: str, runs: Sequence[Run]) -> None:
         self.name, self.best = name, np.array([run["best"] for run in runs])
         self.decisions = sum(len(run["episode"].arrivals) for run in runs)
-        links = [run["link"] for run in runs]
-        self._link = np.unique(links, return_inverse=True)[1]
+        self.capacity = np.array([run["capacity"] for run in runs])
+        self._link = np.unique([run["link"] for run in runs], return_inverse=True)[1]
+        self.links = int(self._link.max()) + 1
         groups: dict[Any, list[int]] = {}
         for i, run in enumerate(runs):
             groups.setdefault((run["capacity"], run["max_bytes"], run["value"].name), []).append(i)
@@ -91,9 +73,15 @@ class Family:
             h[own] = qoi_of(policy, senders, episodes)
         return h
 
-    def shares(self, h: Numbers, weights: NDArray[np.float64] | None = None) -> Numbers:
-        """The share of AFR's regret, float64[1 + resamples]; ``weights`` count the draws of each link."""
+    def shares(
+        self, h: Numbers, weights: NDArray[np.float64] | None = None, part: NDArray[np.bool_] | None = None
+    ) -> Numbers:
+        """The share of AFR's regret, float64[1 + resamples].
+
+        ``weights`` count the draws of each link, and ``part``, bool[runs], says which runs count; by default all do.
+        """
         counts = np.ones((1, len(self.best))) if weights is None else weights[:, self._link]
+        counts = counts if part is None else counts * part
         if self.name.startswith("random"):
             ratios = np.clip((1 - h / self.best + LEAST) / (1 - self.afr / self.best + LEAST), 0, MOST)
             return np.asarray(counts @ ratios / counts.sum(axis=1))
@@ -105,7 +93,6 @@ class Family:
 
     def against(self, several: Sequence[Policy]) -> list[tuple[float, list[Interval]]]:
         """Each policy's share, and how far it lies above each other's, with an interval over links."""
-        links = int(self._link.max()) + 1
-        weights = times_drawn(links, RESAMPLES, np.random.default_rng(0))
+        weights = times_drawn(self.links, RESAMPLES, np.random.default_rng(SEED))
         shares = [self.shares(self.play(policy), weights) for policy in several]
-        return [(float(own[0]), [interval(own - other, links) for other in shares]) for own in shares]
+        return [(float(own[0]), [interval(own - other, self.links) for other in shares]) for own in shares]

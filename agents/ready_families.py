@@ -2,6 +2,10 @@
 
 ``train.py hindsight --families all`` learns from their train splits, chooses by their validation splits, and reports on
 their test splits. The splits share no link, but for ``task``: its validation has other episodes on the training links.
+Each run of a split has a seed of its own, so no two have one motion, offset and jitter.
+
+The test of the agent that ships (``studies.families``) has links of the test splits and new ones, and seeds and drives
+of its own: whatever validation chooses by is kept apart from it.
 """
 
 from __future__ import annotations
@@ -29,8 +33,8 @@ FRAMES = {"train": 96, "validation": 24, "test": 48}
 """Generated links at the default frames."""
 STREAMS = {"train": 96, "validation": 48, "test": 96}
 """Streams of random conditions; three in four have messages of equal size."""
-TASK_EPISODES = {"validation": 1500, "test": 1800}
-"""First seed of episodes on the links of the task."""
+FIRST_EPISODE = {"validation": 100_000, "test": 200_000}
+"""Seeds of a split's runs count up from these."""
 
 
 def frames_over(seeds: Iterable[int]) -> Uplink:
@@ -156,9 +160,8 @@ whose V saturates.
 
 
 def runs_of(family: str, split: str, most: int) -> list[Run]:
-    """So many runs of a family with their bounds: links and L in a random order, with new episodes once all had one."""
+    """So many runs of a family with their bounds: links and L take turns, and each run has a seed of its own."""
     cells = [Cell(trace, part, c.capacity) for c in FAMILIES[family](split) for trace, part in by_trace(c.scenario)]
-    first = TASK_EPISODES[split] if family == "task" else 0
     order = np.random.default_rng(0).permutation(len(cells))
-    found = [(cells[order[k % len(cells)]], first + k // len(cells)) for k in range(most)]
+    found = [(cells[order[k % len(cells)]], FIRST_EPISODE[split] + k) for k in range(most)]
     return [run_of(cell.label, cell.scenario, seed, cell.capacity) for cell, seed in found]

@@ -1,7 +1,6 @@
 """How much is left for an agent that does not know the future? A slow planner that knows the laws tells.
 
-    python -m studies.causal_planner --task uplink
-    python -m studies.causal_planner --task lte-v2 --capacities 5,15
+    python -m studies.learned --planner --only task,lte
 
 At every arrival the planner takes the action that is best on average over futures of link and motion, drawn from their
 laws given what the robot has seen (``studies.futures``). The value of an action in one future is the clairvoyant's: the
@@ -11,46 +10,33 @@ the future were told right after the decision.
 
 With room in the queue accepting costs the clairvoyant nothing, so values are often equal. Of equal actions it takes the
 one of ``target-gap``, else it accepts.
-
-Each episode's rows are kept in a file, so a run that was stopped goes on.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.held_out import FIRST_SEED, HELD_OUT_TRACES, split_scenario
-from agents.tasks import Environment
+from agents.families import Run
 from bufgym import policies
-from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
-from bufgym.benchmark.score import scores
-from bufgym.benchmark.tasks.queue import QueueTask, columns
-from bufgym.cli.options import Capacities, Count, Natural, Positive
 from bufgym.model.buffer import ACCEPT, REJECT, Buffer
 from bufgym.model.link import FOREVER
 from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, new_rivals
 from bufgym.oracle.from_queue import find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.policies import Policy
-from bufgym.scenario import Uplink, suites
-from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace, draw
+from bufgym.scenario import Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.sim.state import ARRIVAL_WAITS, new_batch
 from bufgym.traces.generate.lte import LTE_MODES
 from bufgym.traces.shipped import SHIPPED_LTE
-from studies.futures import DriveSeen, Hidden, Links, LinkSeen, prior, rates
-from studies.page import command, publish, table, written
+from studies.futures import DriveSeen, Hidden, Links, LinkSeen, rates
 
 NAME = "causal-planner"
-RIVALS = ("afr", "drop-oldest", "target-gap", "learned")
 KEPT = 15
 """Most arrivals for which sampled futures serve; they are drawn anew as soon as something new is seen."""
 TIE = 1e-9
@@ -161,104 +147,13 @@ class CausalPlanner:
         return np.asarray(self._values.mean(axis=0))
 
 
-class Case(NamedTuple):
-    """One episode of a task, with L = ``capacity``."""
-
-    label: str
-    trace: str
-    seed: int
-    scenario: Uplink
-    capacity: int
-
-
-def uplink_cases(capacities: Sequence[int], episodes: int) -> Iterator[Case]:
-    """Episodes of ``bufgym/Uplink-v0`` on the two shipped links that ``train.py`` holds out."""
-    for L in capacities or (8,):
-        on = Environment(capacity=L)
-        scenario = split_scenario(on)[True]
-        assert isinstance(scenario, Uplink)
-        scenario = replace(scenario, traces=scenario.traces[:HELD_OUT_TRACES])
-        for k in range(episodes or on.episodes):
-            yield Case("", "", FIRST_SEED["test"] + k, scenario, L)
-
-
-def lte_cases(capacities: Sequence[int], episodes: int) -> Iterator[Case]:
-    """The first of the test episodes of ``lte-v2`` on each link, or on the first ``episodes`` links."""
-    suite = suites.get("lte-v2")
-    for k in range(episodes or len(next(iter(suite.settings("test").values())).scenario.traces)):
-        for label, setting in suite.settings("test").items():
-            trace, scenario = by_trace(setting.scenario)[k]
-            for L in capacities or suite.capacities:
-                yield Case(label, trace, SEEDS_PER_TRACE * k, scenario, L)
-
-
 LTE_V2: Links = [(mode, mean) for mode in LTE_MODES for mean in (3e6, 5e6, 7e6, 9e6)]
-TASKS = {"uplink": (uplink_cases, SHIPPED_LTE), "lte-v2": (lte_cases, LTE_V2)}
-"""Episodes of each task, and the law of its links."""
+LAWS: dict[str, Links] = {"task": SHIPPED_LTE, "lte": LTE_V2}
+"""The law of the links of two families of ``studies.families``."""
 
 
-def played(case: Case, planning: Planning, links: Hidden) -> list[Row]:
-    """Rows of the planner and its rivals; ``planner_s`` is the time that the planner took."""
-    episode = draw(case.scenario, case.seed)
-    plan = QueueTask().best(episode, case.capacity, case.scenario)
-    planner = CausalPlanner(planning, links, case.scenario, case.capacity, case.seed)
-    key = {"scenario": case.label, "trace": case.trace, "seed": case.seed, "capacity": case.capacity}
-    rows = []
-    for policy in (Policy(NAME, planner.on_arrival), *map(policies.get, RIVALS)):
-        began_s = time.process_time()
-        result = outcome(run(policy, [episode], case.capacity, case.scenario.value), 0)
-        spent_s = time.process_time() - began_s
-        row = {**key, "policy": policy.name, **asdict(result), **columns(policy, result.qoi, plan)}
-        rows.append({**{name: row[name] for name in RUNS}, "planner_s": spent_s if policy.name == NAME else 0.0})
-    return rows
-
-
-def standing(rows: Sequence[Row], decisions: int) -> list[str]:
-    """The table of all policies, and what a decision of the planner took."""
-    measured = scores(rows, against="learned").standings
-    lines = [
-        [s.policy, *(written(s[key], form) for key, form in (("score", ".3f"), ("share", ".3f"), ("against", "+.3f")))]
-        for s in measured
-    ]
-    spent_s = sum(row["planner_s"] for row in rows)
-    heads = ["policy", "score", "share of AFR's regret", "share, less learned's"]
-    return [*table(heads, lines), "", f"{1e3 * spent_s / decisions:.1f} ms a decision of the planner"]
-
-
-def main(
-    task: Literal["uplink", "lte-v2"] = "uplink",
-    capacities: Capacities = (),
-    episodes: Natural = 0,
-    futures: Count = 32,
-    horizon_s: Positive = 20.0,
-    untold: bool = False,
-    out: Path = Path("results/causal-planner"),
-) -> None:
-    """Score the planner beside rules and `learned`, with paired 95 % intervals over links (of uplink over episodes).
-
-    Args:
-        task: train.py's held-out episodes of Uplink-v0, or the test split of lte-v2, one episode on each link.
-        capacities: L; by default the task's.
-        episodes: number of episodes of uplink, of links of lte-v2; 0: all.
-        futures: number of futures drawn.
-        horizon_s: how far they reach, s.
-        untold: whether the planner does not know when the stream ends.
-        out: folder for the rows; a run goes on where it was stopped.
-    """
-    cases, law = TASKS[task]
-    planning = Planning(futures, horizon_s, not untold)
-    links = prior(law, np.random.default_rng(0))
-    folder = out / f"{task}-{futures}-{horizon_s:g}s-{'untold' if untold else 'told'}"
-    folder.mkdir(parents=True, exist_ok=True)
-    rows, decisions = [], 0
-    for case in cases(capacities, episodes):
-        file = folder / f"{case.label or task}-{case.capacity}-{case.seed}.csv"
-        if not file.exists():
-            write_rows(played(case, planning, links), file)
-        rows += read_rows(file)
-        decisions += case.scenario.max_messages
-    publish("\n".join(standing(rows, decisions)), None)
-
-
-if __name__ == "__main__":
-    command(main)
+def qoi_of(run_: Run, planning: Planning, links: Hidden, seed: int) -> float:
+    """H of the planner on a run; ``links`` are drawn from the law of its link, and ``seed`` draws the futures."""
+    planner = CausalPlanner(planning, links, run_["scenario"], run_["capacity"], seed)
+    senders = run(Policy(NAME, planner.on_arrival), [run_["episode"]], run_["capacity"], run_["value"])
+    return outcome(senders, 0).qoi

@@ -1,48 +1,42 @@
-"""The page of the shipped agent: `learned` beside the rules on links that taught it nothing.
+"""The test of an agent for one queue on rows that no training saw, and the page of the one that ships.
 
-python -m studies.learned agents/pretrained/learned.safetensors --split test --data DIR --out docs/agents.md
+    python -m studies.learned --data DIR
+    python -m studies.learned runs/new/learned.safetensors --against agents/pretrained/learned.safetensors --data DIR
+    python -m studies.learned --data DIR --planner --out docs/agents.md
 
-Several files are compared, such as the seeds of ``python train.py hindsight --families all --seeds 3``; the page tells
-of the first. ``--against FILE`` adds another agent, such as an older one.
+Without a file it judges the agent that ships. ``--against`` names another agent of any kind, with which the first is
+compared in pairs. ``--planner`` adds the hindsight planner. ``--only task,lte`` judges on these families alone, and
+``unequal`` is judged only so. ``studies.families`` says what the rows are, ``studies.judging`` what the numbers are.
+Bounds and the planner's runs are kept in ``--folder``: a stopped run goes on, and a second agent is only played.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
-from agents.families import Family, Run
 from agents.tasks import FAMILY_NAMES, Names
 from bufgym import policies
+from bufgym.benchmark.bootstrap import written as parts_of
 from bufgym.policies import Policy, weights
 from bufgym.policies.rule_inputs import N_INPUTS
 from bufgym.policies.ruled_network import EVEN_US, PER_CANDIDATE, QUEUE, RuledWeights
 from bufgym.utils.errors import BufgymError
-from studies.families import families
-from studies.page import command, publish, table, written
+from studies import families, judging
+from studies.causal_planner import NAME
+from studies.judging import Row
+from studies.page import command, publish
 
-FOLDER = Path("runs/families")
-"""Where the bounds of the families are kept."""
+SHIPPED = Path("agents/pretrained/learned.safetensors")
+FOLDER = Path("runs/judged")
+"""Where bounds and the planner's runs are kept."""
 TRAINING = "python train.py hindsight --families all --steps 4000000 --validate-every 400000 --seed 1"
-RULES = ("target-gap", "price-dp", "gap-price")
-
-
-def split_up(found: dict[str, list[Run]]) -> dict[str, list[Run]]:
-    """The families, that of the default frames by L."""
-    shown: dict[str, list[Run]] = {}
-    for name, runs in found.items():
-        parts = {L: [run for run in runs if run["capacity"] == L] for L in sorted({run["capacity"] for run in runs})}
-        shown |= {f"{name}, L = {L}": own for L, own in parts.items()} if name == "default-frames" else {name: runs}
-    return shown
-
 
 PAGE = """# learned
 
 **One network for every link**: at every arrival `learned` chooses among a few ordered candidates and the decision of
-the rule `gap-price`. It was made by `{command}`{seed}.
+the rule `gap-price`. It was made by `{made}`{seed}.
 
 - *Sees* the {k} candidates that are cheapest to drop and the head, each by {per_candidate} numbers, and {queue} numbers
   of queue and link (`bufgym.model.observe.candidates`). Beside these it sees the rule's {rule} inputs
@@ -55,67 +49,96 @@ the rule `gap-price`. It was made by `{command}`{seed}.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
 - *Sizes differ*: there it does what `gap-price` does. `bufgym bench --policies gap-price,learned --sizes jpeg` says
   whether their rows are the same.
-- *Falls short* of a rule, by the intervals below: {short}.
+- *Falls short* of a rule, on a row below, by an interval without zero: {short}.
 - *Trained* on {families} families of links and streams at once. [Training](guide/training.md) says how.
 
-```
-{training}
-python -m studies.learned {files} --split {split}{more} --out docs/agents.md
+"""
+TEST = """```
+{command}
 ```
 
-Shares of AFR's regret on the {split} links, which are drawn apart from the training links. Less is better. A family's
-share is a ratio of sums; `random`, whose runs differ in everything, has a mean of ratios.
+Shares of AFR's regret: 0 is the clairvoyant, 1 AFR, less is better. A row's share is a ratio of sums; `random`, whose
+runs differ in everything, has a mean of ratios. Neither training nor validation saw these links or motions.
+
+- `task` has the links that the task holds out.
+- `frames` has the default frames of 4.6 MB over new links of the six ways of moving that training knows, `fresh` over
+  links of seven others.
+- Each run has a jitter, an offset and a motion of its own.
+- In brackets are 95 % intervals over links: all runs of a link are drawn together.
+- `mean` is the mean of the rows.
 
 {shares}
 
-How far `learned` lies above {others}, with 95 % intervals over links:
+How far `{agent}` lies above the rule that leaves least on the same row{others}, paired. Below zero it is better.
+It is better than the best rule by an interval without zero on {better} of {rows} rows, and worse {worse}.
 
-{less}
+{above}
+
+Parts of rows:
+
+{parts}
+"""
+PLANNER = """
+The hindsight planner (`studies/causal_planner.py`) on some of these runs. It knows the law of links and motion, and
+`learned` does not; it is slow, and [the truth](guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
+
+{shares}
+
+{above}
 """
 
 
-def page(
-    files: Sequence[Path], split: str, data: str | None, against: Path | None = None, leave_out: Sequence[str] = ()
-) -> str:
-    """The page of these agents, the one to ship first: its families, and its differences to rules and another agent."""
-    network, notes = weights.read(files[0])
-    if not isinstance(network, RuledWeights):
-        raise BufgymError(f"{files[0]}: is no network among candidates and the decision of gap-price")
-    rivals: dict[str, Policy] = {name: policies.get(name) for name in RULES}
-    if against is not None:
-        rivals[against.stem] = policies.load(against)
-    agents = [policies.load(file) for file in files]
-    shares, less, sums, short = [], [], np.zeros(len(rivals) + len(agents)), []
-    for name, runs in split_up(families(split, FOLDER, data, leave_out)).items():
-        found = Family(name, runs).against([*rivals.values(), *agents])
-        above = dict(zip(rivals, found[len(rivals)][1], strict=False))
-        shares.append([name, *(f"{share:.3f}" for share, _ in found)])
-        less.append([name, *(written(interval, "+.3f") for interval in above.values())])
-        short += [f"{rule} on {name} ({above[rule].value:+.3f})" for rule in RULES if above[rule].low > 0]
-        sums += [share for share, _ in found]
-        print(" | ".join(shares[-1]), flush=True)
-    shares.append(["mean", *(f"{total / len(less):.3f}" for total in sums)])
-    more = (" --data DIR" if data else "") + (f" --against {against}" if against else "")
-    more += f" --leave-out {','.join(leave_out)}" if leave_out else ""
-    return PAGE.format(
-        **_described(network, notes),
-        files=" ".join(map(str, files)),
-        split=split,
-        more=more,
-        short=", ".join(short) or "nowhere here",
-        others="a rule" if against is None else f"a rule and {against.stem}",
-        shares="\n".join(table(["", *rivals, *(file.stem for file in files)], shares)),
-        less="\n".join(table(["", *rivals], less)),
+def named(files: Sequence[Path]) -> dict[str, Policy]:
+    """The agents by the names of their files, by their paths where two have one name."""
+    stems = [file.stem for file in files]
+    names = [file.stem if stems.count(file.stem) == 1 else str(file) for file in files]
+    return dict(zip(names, map(policies.load, files), strict=True))
+
+
+def tables(
+    files: Sequence[Path],
+    against: Path | None,
+    makers: Mapping[str, families.Maker],
+    folder: Path,
+    planner: bool,
+    line: str,
+) -> tuple[str, str]:
+    """What the test found, and on which rows the first agent falls short of a rule; ``line`` is the command."""
+    agents = named([*files, *([against] if against else [])])
+    agent, *others = agents
+    rows, parts, runs = judging.judged_all(makers, folder, {**judging.rules(), **agents})
+    columns = [*judging.RULES, *agents]
+    better = [row for row in rows if row.above(agent, row.best_rule).high < 0]
+    worse = [row for row in rows if row.above(agent, row.best_rule).low > 0]
+    every = [*rows, judging.mean_of(rows)]
+    text = TEST.format(
+        command=line,
+        agent=agent,
+        others="".join(f", and above `{other}`" for other in others),
+        better=len(better),
+        rows=len(rows),
+        worse=f"on {len(worse)}" if worse else "on none",
+        shares=judging.shares_table(every, columns, agent),
+        above=judging.above_table(every, agent, others),
+        parts=judging.above_table(parts, agent, others) if parts else "none",
     )
+    if planner:
+        found = list(judging.planned(runs, folder, {**judging.rules(), **agents}))
+        shares = judging.shares_table(found, [NAME, *columns], agent)
+        text += PLANNER.format(shares=shares, above=judging.above_table(found, NAME, [agent]))
+    return text, ", ".join(_short(row, agent) for row in worse) or "nowhere here"
+
+
+def _short(row: Row, agent: str) -> str:
+    return f"`{row.best_rule}` on {row.name} ({' '.join(parts_of(row.above(agent, row.best_rule), '{:+.3f}'.format))})"
 
 
 def _described(network: RuledWeights, notes: Mapping[str, Any]) -> dict[str, Any]:
     """What the page says of the network and its making."""
     widths = [len(bias) for _, bias in network.layers]
     return {
-        "command": notes.get("training", TRAINING),
+        "made": notes.get("training", TRAINING),
         "seed": "".join(f", seed {seed}" for seed in notes.get("seeds", [])[:1]),
-        "training": TRAINING,
         "families": len(FAMILY_NAMES),
         "k": network.candidates,
         "per_candidate": PER_CANDIDATE,
@@ -129,27 +152,45 @@ def _described(network: RuledWeights, notes: Mapping[str, Any]) -> dict[str, Any
     }
 
 
+def _line(
+    files: Sequence[Path], against: Path | None, data: str | None, only: Sequence[str], planner: bool, out: Path | None
+) -> str:
+    """The command that makes the page again."""
+    words = ["python -m studies.learned", *(map(str, files) if list(files) != [SHIPPED] else ())]
+    words += [f"--against {against}"] * bool(against) + ["--data DIR"] * bool(data)
+    words += [f"--only {','.join(only)}"] * bool(only) + ["--planner"] * planner + [f"--out {out}"] * bool(out)
+    return " ".join(words)
+
+
 def main(
     *files: Path,
-    split: Literal["validation", "test"] = "validation",
-    data: str | None = None,
     against: Path | None = None,
-    leave_out: Names = (),
+    data: str | None = None,
+    only: Names = (),
+    planner: bool = False,
+    folder: Path = FOLDER,
     out: Path | None = None,
 ) -> None:
-    """Compare agents for one queue with the rules, as a page.
+    """Judge agents for one queue beside the rules, on rows that no training saw.
 
     Args:
-        files: agents to compare, the one to ship first.
-        split: validation or test, of the links to compare on.
-        data: folder of recordings, to compare on recorded uplinks as well.
+        files: agents, the one that is judged first; by default the one that ships.
         against: another agent, of any kind, with which the first is compared too.
-        leave_out: families to leave out, such as unequal-heavy,unequal-light, whose bounds take a quarter of an hour.
-        out: the Markdown file; printed in any case.
+        data: folder of recordings, to judge on recorded uplinks as well.
+        only: families to judge on, such as task,lte; by default all but unequal, whose bounds take minutes.
+        planner: whether the hindsight planner plays as well, on some runs of task and lte.
+        folder: where bounds and the planner's runs are kept.
+        out: a Markdown file for the page of the agent that ships, such as docs/agents.md.
     """
-    if not files:
-        raise BufgymError("name at least one file of an agent, such as agents/pretrained/learned.safetensors")
-    publish(page(files, split, data, against, leave_out), out)
+    chosen, makers = files or (SHIPPED,), families.chosen(data, only)
+    network, notes = weights.read(chosen[0]) if out else (None, {})
+    if out and not isinstance(network, RuledWeights):
+        raise BufgymError(f"{chosen[0]}: is no network among candidates and the decision of gap-price")
+    line = _line(chosen, against, data, only, planner, out)
+    text, short = tables(chosen, against, makers, folder, planner, line)
+    if isinstance(network, RuledWeights):
+        text = PAGE.format(**_described(network, notes), short=short) + text
+    publish(text, out)
 
 
 if __name__ == "__main__":

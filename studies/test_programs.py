@@ -28,7 +28,6 @@ NEEDED = {
 }
 ELSEWHERE = {
     "studies.bounds": "studies/test_bounds.py",
-    "studies.causal_planner": "studies/test_causal_planner.py",
     "studies.coverage": "studies/test_coverage.py",
     "studies.fit": "studies/test_fit_page.py",
     "studies.fit_sizes": "studies/test_fit_sizes.py",
