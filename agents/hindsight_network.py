@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from bufgym.policies.candidate_network import CandidateWeights, inputs
-from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
+from bufgym.policies.ruled_network import RememberingWeights, fields_seen, seen
 
 START = 2.0
 """Bias of action 0 before learning, "accept where there is room, else drop the cheapest"; all other outputs are 0."""
@@ -47,7 +47,7 @@ class Student(nn.Sequential):
         """The weights as in a file."""
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
-        kind = RuledWeights if self.ruled else CandidateWeights
+        kind = RememberingWeights if self.ruled else CandidateWeights
         return kind(self.candidates, at_arrivals=True, masks=True, activation=self.activation, layers=layers)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bufgym.jit import kernel, unchecked_item
 from bufgym.model.documented import documented
+from bufgym.model.past import PAST, Past
 from bufgym.model.qoi import merging_loss, value
 from bufgym.utils.errors import BufgymError
 
@@ -69,6 +70,8 @@ HOLD = -1
 UNLIMITED_BYTES = 2**62
 NO_PARAMETERS: NDArray[np.float64] = np.zeros(0)
 NO_PARAMETERS.flags.writeable = False
+NO_PAST: Past = np.zeros(PAST)
+NO_PAST.flags.writeable = False
 MAX_CAPACITY = 10**6
 
 
@@ -154,6 +157,8 @@ class Buffer(NamedTuple):
     """Time until the stream ends, as far as the robot was told, at least 0; FOREVER if it was not."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: the policy's own settings in the order of its registration, or its weights."""
+    past: Past = NO_PAST
+    """float64[PAST]: what was measured of link and camera so far; ``bufgym.model.past`` has its entries."""
 
 
 @kernel

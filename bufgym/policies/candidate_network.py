@@ -227,8 +227,8 @@ class CandidateWeights:
         asked = "at arrivals" if settings["at_arrivals"] else "at a full buffer"
         return f"{settings['candidates']} candidates, {asked},"
 
-    @staticmethod
-    def ends(settings: Mapping[str, Any]) -> tuple[int, int]:
+    @classmethod
+    def ends(cls, settings: Mapping[str, Any]) -> tuple[int, int]:
         """How many numbers go in, and how many come out."""
         k = settings["candidates"]
         return inputs(k), k + 1 + settings["at_arrivals"]

@@ -17,6 +17,7 @@ from bufgym.model.observe import (
     FIELDS,
     ON_BOARD_FIELDS,
     ON_BOARD_SLOT_FIELDS,
+    PAST_FIELDS,
     SLOT_FIELDS,
     observe,
     observe_on_board,
@@ -143,10 +144,11 @@ class Weights:
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights; it works for every L."""
         on_link = any(field.group == "link" for field in BESIDE if field.name in self.fields)
+        past = any(field.name in self.fields for field in PAST_FIELDS)
         numbers, (first, second) = tuple(self.parameters().tolist()), self.widths
         work = 2 * len(self.fields) - len(self.context) + 2 * first + second + CONTEXT, SLOTS  # see ``divide``
         policy = Policy(name, on_arrival, weights=numbers, work=work, compile=True, reads_left=True, built_in=True)
-        return replace(policy, reads_rate=on_link, about=about, source=source)
+        return replace(policy, reads_rate=on_link, reads_past=past, about=about, source=source)
 
     @staticmethod
     def definition(fields: Sequence[str]) -> list[Any]:

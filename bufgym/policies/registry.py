@@ -122,6 +122,8 @@ class Policy:
     """Whether its functions are bufgym's own; ``register`` then keeps its name."""
     reads_rate: bool = False
     """Whether a built-in policy reads the link's rate, which takes time to measure. Others may always read it."""
+    reads_past: bool = False
+    """The same for the past of link and camera, ``buffer.past``."""
     reads_left: bool = False
     """The same for the bytes left in the socket."""
     client: ClientSettings = ClientSettings()
@@ -156,7 +158,12 @@ class Policy:
     @property
     def measures(self) -> bool:
         """Whether the link's rate must be measured for it."""
-        return self.reads_rate or not self.built_in
+        return self.reads_rate or self.remembers
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the past of link and camera must be kept for it."""
+        return self.reads_past or not self.built_in
 
     @property
     def unranked_because(self) -> str:
@@ -222,7 +229,12 @@ def _compiled(*functions: Any) -> Functions:
 def view_kind() -> Tuple:
     """The kind of a ``Buffer``."""
     constants = array_kind(float, constant=True)
-    kinds: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants}
+    kinds: dict[str, Any] = {
+        "slots": array_kind(MESSAGE),
+        "v": constants,
+        "parameters": constants,
+        "past": array_kind(float),
+    }
     kinds |= {"topics": array_kind(TOPIC)}
     kinds |= {name: FLOAT for name, kind in get_type_hints(Buffer).items() if kind is float}
     return Tuple(tuple(kinds.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")

@@ -18,7 +18,7 @@ from safetensors.numpy import save as serialized
 from bufgym.policies.candidate_network import CandidateWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
-from bufgym.policies.ruled_network import RuledWeights
+from bufgym.policies.ruled_network import RememberingWeights, RuledWeights
 from bufgym.utils import __version__, strict_json
 from bufgym.utils.errors import BufgymError, where
 from bufgym.utils.files import read_whole, replaced
@@ -124,7 +124,7 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     for network, now in GONE.items():
         if network in prefixes:
             raise BufgymError(f"{path}: numbers that moved a rule's, as bufgym made them until 0.2: {now}")
-    kinds: tuple[Kind, ...] = (CandidateWeights, RuledWeights)
+    kinds: tuple[Kind, ...] = (CandidateWeights, RuledWeights, RememberingWeights)
     kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
     fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}

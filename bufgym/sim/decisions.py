@@ -2,6 +2,7 @@
 
 from bufgym.jit import kernel, unchecked_at, unchecked_slice
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, evict, of_topic, push, running_mean
+from bufgym.model.past import begin_past, remember_past
 from bufgym.sim import rules
 from bufgym.sim.socket import held_bytes, left_of
 from bufgym.sim.state import (
@@ -46,7 +47,13 @@ def arrive(batch: Batch, i: int) -> int:
         sender.service_ratio += _SERVICE_WEIGHT * (sender.departures - sender.service_ratio)
         if sender.measures == 1:
             measure_rate(batch, i)
+            if sender.remembers == 1:
+                remember_past(
+                    batch.past[i], arrives_us, gap_us, arrival.x, arrival.x - sender.previous_x,
+                    sender.sent_bytes, sender.sending_us, 1e6 * sender.medium_rate,
+                )  # fmt: skip
     else:
+        begin_past(batch.past[i], arrives_us, arrival.x)
         sender.previous_us, sender.previous_x = arrives_us, arrival.x
         sender.arrival_bytes = float(arrival.size_bytes)
     # Rate limits come before the policy, as in Robofleet's client: it never sees what they drop.

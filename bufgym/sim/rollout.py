@@ -86,6 +86,7 @@ def python_view(batch: Batch, i: int) -> Buffer:
     buffer: Buffer = _view(batch, i)
     buffer.slots.flags.writeable = False
     buffer.topics.flags.writeable = False
+    buffer.past.flags.writeable = False
     return buffer
 
 

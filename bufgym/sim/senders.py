@@ -101,6 +101,7 @@ class Senders:
             self.episodes[i], self._uniforms[i] = episode, uniforms
         self.begun[rows] += 1
         topics[rows] = self._rules
+        batch.past[rows] = 0.0
         beginnings = np.repeat(self._beginning[None], len(rows), 0)
         if begun:
             beginnings[:, _EPISODE], beginnings[:, _V], beginnings[:, _PLACE] = episodes, v_starts, places
@@ -174,6 +175,7 @@ class Senders:
         senders, client = self.batch.senders, policy.client
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         senders["measures"], senders["shows_left"] = policy.measures, policy.measures or policy.reads_left
+        senders["remembers"] = policy.remembers
         for rule in ("limit_at_send", "limit_since_sent", "flush_no_drop"):
             senders[rule] = getattr(client, rule)
         if not client.awaits_acks:

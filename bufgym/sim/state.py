@@ -9,6 +9,7 @@ from bufgym.jit import kernel, records
 from bufgym.model.buffer import MESSAGE, NO_PARAMETERS, TOPIC, row_width
 from bufgym.model.documented import documented
 from bufgym.model.link import FOREVER
+from bufgym.model.past import PAST
 
 END, DEPARTURE, DECISION, DEQUEUE, SEND = range(5)
 """Events of a sender (see the package's text)."""
@@ -34,6 +35,7 @@ SENDER = np.dtype(
         ("screens", np.int64),  # 1: an arrival may ask for no decision, or for several: ask_when_full, or a limit B
         ("ask_at_dequeue", np.int64),  # 1: the policy may drop the head before the socket dequeues it
         ("measures", np.int64),  # 1: the link's rate is measured at each arrival; 0: nobody reads it
+        ("remembers", np.int64),  # 1: the past of link and camera is kept, of what is measured; 0: nobody reads it
         ("shows_left", np.int64),  # 1: the bytes left in the socket are shown; 0: nobody reads them
         ("ask_at_send", np.int64),  # 1: a scheduler chooses which message the socket dequeues
         ("topics", np.int64),  # 1: one queue, whatever the messages' topics; else each topic has rules of its own
@@ -156,6 +158,8 @@ class Batch(NamedTuple):
     """float64[entries]: the value functions, one after the other (``Value.array``)."""
     topics: NDArray[Any]
     """TOPIC[n, topics]: the rules and the past of each topic; one row for a single queue."""
+    past: NDArray[np.float64]
+    """float64[n, PAST]: what each sender remembers of its link and its camera."""
     parameters: NDArray[np.float64] = NO_PARAMETERS
     """float64[parameters], read-only: parameters of the present policy, as ``view`` shows them."""
     several: bool | None = None
@@ -166,8 +170,9 @@ def new_batch(n: int, capacity: int, messages: int, topics: int, v: NDArray[np.f
     """Make arrays for n senders with L = ``capacity`` and at most ``messages`` arriving messages; no traces yet."""
     slots, rules, several = records((n, row_width(capacity)), MESSAGE), records((n, topics), TOPIC), topics > 1 or None
     arrivals, log = records((n, messages), MESSAGE), records((n, messages), LOG_ENTRY)
-    order, knot_us, knot_bytes = np.zeros((n, messages), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return Batch(records(n, SENDER), slots, arrivals, log, order, knot_us, knot_bytes, v, rules, several=several)
+    order, past = np.zeros((n, messages), np.int64), np.zeros((n, PAST))
+    knot_us, knot_bytes = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return Batch(records(n, SENDER), slots, arrivals, log, order, knot_us, knot_bytes, v, rules, past, several=several)
 
 
 @kernel
@@ -182,6 +187,13 @@ def beginning(**settings: float) -> NDArray[np.int64]:
     NumPy copies records field by field; it copies words five times as fast.
     """
     record = np.zeros(1, SENDER)
-    for name, number in {"first": 1, "finish_us": FOREVER, "measures": 1, "shows_left": 1, **settings}.items():
+    for name, number in {
+        "first": 1,
+        "finish_us": FOREVER,
+        "measures": 1,
+        "remembers": 1,
+        "shows_left": 1,
+        **settings,
+    }.items():
         record[name] = number
     return record.view(np.int64)

@@ -61,6 +61,7 @@ def view(batch: Batch, i: int) -> Buffer:
         1e6 * sender.short_rate, 1e6 * sender.medium_rate, 1e6 * sender.long_rate,
         batch.v[sender.v_start :], unchecked_slice(batch.topics, i, 0, sender.topics),
         sender.window, sender.dequeued - sender.acked, sender.evictions, remaining_us, batch.parameters,
+        batch.past[i],
     )  # fmt: skip
 
 

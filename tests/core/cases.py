@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym.jit import records
 from bufgym.model import qoi
-from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, REJECT, TOPIC, UNLIMITED_BYTES, Buffer
+from bufgym.model.buffer import ACCEPT, MESSAGE, NO_PARAMETERS, NO_PAST, REJECT, TOPIC, UNLIMITED_BYTES, Buffer
 from bufgym.model.link import FOREVER, Link
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, messages
@@ -44,7 +44,9 @@ def queue_of(s: int, capacity: int, parameters: NDArray[np.float64] = NO_PARAMET
     """What a policy sees of s queued messages without bytes to speak of; the rest is 0."""
     fields: dict[str, Any] = dict.fromkeys(Buffer._fields, 0)
     fields.update(slots=records(s, MESSAGE), topics=records(1, TOPIC), v=qoi.exponential(0.5).array)
-    fields.update(capacity=capacity, max_bytes=UNLIMITED_BYTES, remaining_us=FOREVER, parameters=parameters)
+    fields.update(
+        past=NO_PAST, capacity=capacity, max_bytes=UNLIMITED_BYTES, remaining_us=FOREVER, parameters=parameters
+    )
     return Buffer(**fields)
 
 

@@ -12,12 +12,21 @@ from hypothesis import strategies as st
 from weight_cases import random_choices, random_ruled
 
 from bufgym import policies
-from bufgym.model import qoi
+from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
 from bufgym.policies import chains, price_dp, rule_inputs, target_gap, thinning, weights
+from bufgym.policies.past_inputs import NOTHING
 from bufgym.policies.registry import Policy
-from bufgym.policies.ruled_network import NOT_OFFERED, fields_seen, seen, watched, watcher
+from bufgym.policies.ruled_network import (
+    NOT_OFFERED,
+    RememberingWeights,
+    RuledWeights,
+    fields_seen,
+    seen,
+    watched,
+    watcher,
+)
 from bufgym.scenario import Episode, messages
 
 kernels = pytest.mark.kernels
@@ -47,12 +56,18 @@ def reference(made, margins):
         by_rule = priced[0](buffer, arrival, rule, rule_inputs.BASE, *priced[1])
         candidates, x = found(buffer, arrival, made.candidates)
         does, room = decisions_of(buffer, arrival, [j for j, _ in candidates])
-        is_old = memory[rule_inputs.RULE + target_gap.SEEN_US] > 3e6
-        if is_old and thinning.steady(buffer) and math.sqrt(memory[rule_inputs.LOG_RATE_VARIANCE]) < 0.005:
+        is_even = memory[rule_inputs.RULE + target_gap.SEEN_US] > 3e6
+        is_even = is_even and math.sqrt(memory[rule_inputs.LOG_RATE_VARIANCE]) < 0.005
+        past = []
+        if made.REMEMBERS:
+            numbers = {f.name: f.function(buffer, arrival) for f in observe.ON_BOARD_FIELDS}
+            past = [4 * (numbers[name] - nothing) for name, nothing in NOTHING.items()]
+            is_even = numbers["since_change"] > 0.6  # 3 s beside 2 s
+        if is_even and thinning.steady(buffer):
             does = [None for _ in does]
         same_as_rule = [float(decision == by_rule) for decision in does]
         state = [float(room), math.log(buffer.capacity / 8)]
-        ranked = outputs(made, [*observed(buffer, arrival, candidates, x), *known, *state, *same_as_rule])
+        ranked = outputs(made, [*observed(buffer, arrival, candidates, x), *known, *state, *past, *same_as_rule])
         offered = [
             (value, decision) for value, decision in zip(ranked, [*does, by_rule], strict=True) if decision is not None
         ]
@@ -60,7 +75,7 @@ def reference(made, margins):
         margins.append(best - max((value for value, other in offered if other != decision), default=-math.inf))
         return decision
 
-    return Policy("reference", on_arrival, memory=rule_inputs.REMEMBERED, work=chains.SCRATCH, reads_rate=True)
+    return Policy("reference", on_arrival, memory=rule_inputs.REMEMBERED, work=chains.SCRATCH)
 
 
 @st.composite
@@ -68,7 +83,8 @@ def networks(draw):
     """Any number of candidates, of hidden layers and of units."""
     widths = draw(st.sampled_from([(), (1,), (5,), (4, 3), (3, 2, 4)]))
     activation, k, seed = draw(st.sampled_from(["tanh", "relu"])), draw(st.integers(1, 5)), draw(st.integers(0, 2**32))
-    return random_ruled(k, *widths, activation=activation, seed=seed, accept=2.0)
+    kind = draw(st.sampled_from([RememberingWeights, RuledWeights]))
+    return random_ruled(k, *widths, activation=activation, seed=seed, accept=2.0, kind=kind)
 
 
 @kernels

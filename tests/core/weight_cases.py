@@ -13,7 +13,7 @@ from bufgym import policies
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.ruled_network import RuledWeights, seen
+from bufgym.policies.ruled_network import RememberingWeights, seen
 from bufgym.utils.errors import BufgymError
 
 
@@ -59,9 +59,10 @@ def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed
     )
 
 
-def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0):
+def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0, kind=RememberingWeights):
     """Of a network among k candidates, the head and what the rule does, inclined to its first action by ``accept``."""
-    return RuledWeights(k, True, True, activation, random_layers([seen(k), *widths, k + 3], seed, accept))
+    layers = random_layers([seen(k, kind.REMEMBERS), *widths, k + 3], seed, accept)
+    return kind(k, True, True, activation, layers)
 
 
 KINDS = QUEUE, CHOICES = Weights, CandidateWeights

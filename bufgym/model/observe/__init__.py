@@ -30,6 +30,7 @@ from bufgym.model.observe.own import (
     own_term,
     reward_term,
 )
+from bufgym.model.observe.past import PAST_FIELDS
 from bufgym.model.observe.queue import CONTEXT_FIELDS, SLOT_FIELDS, observe
 from bufgym.model.observe.terms import TOPIC_REWARD_TERMS, terms_for
 from bufgym.model.observe.topics import (
@@ -43,7 +44,7 @@ from bufgym.model.observe.topics import (
 
 __all__ = [
     "BUILT_IN", "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS",
-    "OWN_FIELDS", "OWN_TERMS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS",
+    "OWN_FIELDS", "OWN_TERMS", "PAST_FIELDS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS",
     "TOPIC_FIELDS", "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Chosen", "Field", "OwnTerm", "RewardTerm",
     "chosen_at", "decision_of_candidate", "field", "find_candidates", "is_offered", "observe", "observe_candidates",
     "observe_on_board", "observe_on_board_slots", "observe_topic_context", "observe_topic_slots", "own_field",

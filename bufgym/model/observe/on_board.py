@@ -13,6 +13,7 @@ from bufgym.jit import kernel
 from bufgym.model.buffer import Buffer, gaps
 from bufgym.model.link import FOREVER
 from bufgym.model.observe.declare import Field, chooser, clear, squash, writer
+from bufgym.model.observe.past import PAST_FIELDS
 
 
 @kernel
@@ -80,6 +81,9 @@ ON_BOARD_FIELDS = (
     Field("remaining", "context", "time", "g/(g+r), r = 10 s",
           "time until the stream ends, as far as the robot was told; 1 where it was not",
           lambda buffer, arrival: squash(float(buffer.remaining_us), 10e6) if buffer.remaining_us < FOREVER else 1.0),
+    Field("told", "context", "time", "1 or 0", "whether the robot was told when the stream ends",
+          lambda buffer, arrival: 1.0 if buffer.remaining_us < FOREVER else 0.0),
+    *PAST_FIELDS,
 )  # fmt: skip
 """Context fields, in the order in which ``observe_on_board`` writes them."""
 observe_on_board = writer(ON_BOARD_FIELDS, "buffer, arrival")

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from bufgym import policies
-from bufgym.kernels.kinds import FLOAT, Pointer, Record, array_kind, record_kind
+from bufgym.kernels.kinds import FLOAT, INT, Pointer, Record, array_kind, record_kind
 from bufgym.kernels.program import Program
 from bufgym.model import qoi
 from bufgym.model.buffer import MESSAGE, TOPIC, UNLIMITED_BYTES, Buffer, check_limits
 from bufgym.model.link import FOREVER
+from bufgym.model.past import PAST, begin_past, remember_past
 from bufgym.model.qoi import Value
 from bufgym.policies import Policy
 from bufgym.policies.registry import signatures, view_kind
@@ -32,6 +33,9 @@ _SEEN = {
     "long_rate_bytes_per_s": "1e6 * q->long_rate", "remaining_us": "bufgym_remaining_us(q)",
 }  # fmt: skip
 """Field of a ``Buffer`` -> what it is in C, where the queue has no member of that name."""
+_REMEMBER = """        bufgym_remember_past({}, q->now_us, gap_us, arrival->x, arrival->x - q->previous_x,
+                             q->sent_bytes, q->sending_us, 1e6 * q->medium_rate);
+"""
 _SEED, _EPISODES, _MESSAGES = 20_220_523, 6, 40  # Seed, episodes and messages of the calls in the header
 
 
@@ -90,6 +94,11 @@ def header(
     reals = array_kind(float, constant=True)
     program.hook("bufgym_value_of", qoi.value, Pointer((reals, FLOAT), FLOAT))
     of = {kind: program.maker(program.c_type(kind)) for kind in (reals, array_kind(MESSAGE), array_kind(TOPIC))}
+    past = f"{of[reals]}(q->past, {PAST})"
+    if policy.remembers:
+        program.hook("bufgym_begin_past", begin_past, Pointer((array_kind(float), INT, FLOAT), None))
+        noted = (array_kind(float), INT, INT, FLOAT, FLOAT, INT, INT, FLOAT)
+        program.hook("bufgym_remember_past", remember_past, Pointer(noted, None))
     fixed, per_candidate = len(policy.memory) + policy.work[0], policy.work[1]
     size = f"{max(1, fixed)}" + f" + {per_candidate} * (BUFGYM_CAPACITY + 1)" * (per_candidate > 0)
     unlimited = max_bytes is None
@@ -103,6 +112,9 @@ def header(
         "UNLIMITED": UNLIMITED_BYTES,
         "MAX_BYTES": "BUFGYM_UNLIMITED" if unlimited else f"INT64_C({max_bytes})",
         "LIMIT": "no limit" if unlimited else max_bytes,
+        "PAST": PAST,
+        "BEGIN_PAST": f"        bufgym_begin_past({past}, q->now_us, arrival->x);\n" if policy.remembers else "",
+        "REMEMBER_PAST": _REMEMBER.format(past) if policy.remembers else "",
         "MEMORY": _lines(policy.memory.values()),
         "MEMORY_SIZE": size,
         "MEMORY_PART": f"{of[reals]}(q->memory, {size})",
@@ -120,6 +132,7 @@ def header(
     seen = {name: f"q->{name}" for name in Buffer._fields} | _SEEN
     seen["slots"] = f"{of[array_kind(MESSAGE)]}(q->slots, q->occupancy)"
     seen["v"] = numbers["V"]
+    seen["past"] = past
     seen["parameters"] = f"{of[reals]}((double *)bufgym_parameters, {len(policy.parameter_array)})"
     seen["topics"] = f"{of[array_kind(TOPIC)]}(&bufgym_topic, 1)"
     members = zip(program.members(view_kind()), Buffer._fields, strict=True)

@@ -62,6 +62,7 @@ struct bufgym_queue {
     double short_rate, medium_rate, long_rate;
     int64_t sent_bytes, sending_us;     /* all until the arrival before */
     int64_t drained_bytes, drained_us;  /* since then */
+    double past[@PAST@];                /* what is remembered of link and camera, where the policy reads it */
     double memory[@MEMORY_SIZE@];       /* what the policy remembers */
 };
 
@@ -173,7 +174,7 @@ static inline void bufgym_note(struct bufgym_queue *q, const struct bufgym_messa
         q->previous_us = arrival->arrival_us;
         q->previous_x = arrival->x;
         q->arrival_bytes = (double)arrival->size_bytes;
-    } else {
+@BEGIN_PAST@    } else {
         int64_t gap_us = arrival->arrival_us - q->previous_us;
         if (q->arrived == 1)
             q->period_us = (double)gap_us;
@@ -181,7 +182,7 @@ static inline void bufgym_note(struct bufgym_queue *q, const struct bufgym_messa
         q->arrival_bytes += 0.125 * ((double)arrival->size_bytes - q->arrival_bytes);
         q->service_ratio += 0.0625 * ((double)q->departures - q->service_ratio);
         bufgym_measure_rate(q);
-    }
+@REMEMBER_PAST@    }
 }
 
 /* The policy's answer. */
