@@ -53,12 +53,12 @@ def _section(title: str, about: str, tables: dict[str, type[Any]]) -> Iterator[s
     if about:
         yield about
     rows = [
-        (f"`{prefix}{field.name}`", _default(field), code(meaning))
+        (f"`{prefix}{field.name}`", code(meaning), _default(field))
         for prefix, kind in tables.items()
         for field, meaning in zip(*_documented(kind), strict=True)
     ]
-    text = table(("key", "default", "meaning"), rows)
-    yield re.sub(r"^\| | \|$", "", text, flags=re.MULTILINE) + "\n"
+    text = table(("key", "meaning", "default"), rows)
+    yield re.sub(r"^\| | \|$", "", text, flags=re.MULTILINE).replace("| ---:", "| ---") + "\n"
 
 
 def _documented(kind: type[Any]) -> tuple[list[FieldInfo], list[str]]:
@@ -80,8 +80,10 @@ def _default(field: FieldInfo) -> str:
         return "required"
     default = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
     if default is None or default in ("", ()):
-        return ""
-    return f"`{default:_}`" if type(default) is int and default > 9_999 else f"`{json.dumps(default)}`"
+        return "none"
+    text = f"{default:_}" if type(default) is int and default > 9_999 else json.dumps(default)
+    # In a table, some readers of Markdown show the backslash of an escaped bar.
+    return f"<code>{text.replace('|', '&#124;')}</code>" if "|" in text else f"`{text}`"
 
 
 if __name__ == "__main__":
