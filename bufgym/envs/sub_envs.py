@@ -14,12 +14,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym.envs.candidates import new_choices
+from bufgym.envs.cost import CHARGED, Charges
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.regret import Regret
-from bufgym.envs.reward import reward_weights
+from bufgym.envs.reward import APART, reward_weights
 from bufgym.envs.step import step_rows
 from bufgym.jit import Repeated
 from bufgym.model.observe import (
@@ -63,6 +64,7 @@ class SubEnvs:
     """
 
     keeps_slots = False  # whether slot fields are computed even where none is observed
+    robots = 1  # that share a link
 
     def __init__(self, n: int, scenario: Scenario, options: Options) -> None:
         several_topics = bool(scenario.topics)
@@ -102,17 +104,20 @@ class SubEnvs:
         self.terms = terms_for(several_topics) + own_terms
         scaled = len(self.terms) - len(own_terms) if options.reward_scale == "episode" else None
         self.weights[:scaled] *= options.reward_factor(scenario)
-        self._term_names = [term.name for term in self.terms]
-        self.rewarded = np.zeros((n, len(self.terms)))
-        of_steps = tuple(term for term in own_terms if term.name != "regret")
-        self._own_terms = OwnTerms(of_steps, len(self.terms) - len(own_terms), n)
-        self._regret = Regret(self.senders, len(self.terms) - 1) if len(of_steps) < len(own_terms) else None
+        self._term_names = names = [term.name for term in self.terms]
+        self.rewarded = np.zeros((n, len(names)))
+        of_steps = tuple(term for term in own_terms if term.name not in APART)
+        self._own_terms = OwnTerms(of_steps, len(names) - len(own_terms), n)
+        self._regret = Regret(self.senders, names.index("regret")) if "regret" in names else None
+        self._charges = None
+        if any(name in names for name in CHARGED):
+            self._charges = Charges(self.senders, names, options.reference, self.robots)
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
         self._own_fields = OwnFields(self.form)
-        self._sums_here = bool(own_terms)
-        self._has_own = bool(own_terms or self.form.own_places)
+        self._sums_here = bool(of_steps) or self._regret is not None
+        self._has_own = self._sums_here or bool(self.form.own_places)
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
@@ -218,12 +223,19 @@ class SubEnvs:
                     given = numbered(self.scenario, **given)
                 begun.append((i, given, None))
         self.senders.load_all(begun)
+        if self._charges is not None:
+            self._charges.begin(rows)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         return rows
 
     def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        call(step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)
+        call(
+            step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named,
+            self.options.repeat,
+        )  # fmt: skip
+        if self._charges is not None:
+            self._charges.write(call, rows, len(actions) == 0, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
