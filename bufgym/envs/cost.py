@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from bufgym.envs.output import StepOutput, add_rewards, settle_gains
 from bufgym.jit import kernel, unchecked_at
 from bufgym.model.qoi import value
+from bufgym.policies import Policy
 from bufgym.sim import Senders
 from bufgym.sim.rules import gain_behind
 from bufgym.sim.shadow import Shadows, catch_up
@@ -105,7 +106,7 @@ def write_paired(
 class Charges:
     """The terms of this module that an environment names, written for all of its rows after each step."""
 
-    def __init__(self, senders: Senders, names: Sequence[str], reference: str, robots: int = 1) -> None:
+    def __init__(self, senders: Senders, names: Sequence[str], reference: str | Policy, robots: int = 1) -> None:
         """``names`` are those of all terms, by column. ``robots`` share a link each; none has a shadow then."""
         n, self._senders, self._robots = len(senders), senders, robots
         self._cost, self._paired = (names.index(name) if name in names else -1 for name in CHARGED)

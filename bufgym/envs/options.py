@@ -11,6 +11,7 @@ from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
 from bufgym.model.checks import above_0, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
+from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 from bufgym.utils.errors import BufgymError, UnknownArgumentError, unknown
@@ -51,7 +52,7 @@ class Options:
     max_bytes: int | None = None
     decide_at: str | None = None
     reward: str | Mapping[str, float] = "retained"
-    reference: str = "min-motion-gap"
+    reference: str | Policy = "min-motion-gap"
     reward_scale: float | str | None = None
     actions: str = CANDIDATES
     candidates: int = 2

@@ -61,7 +61,7 @@ def step_rows(
     chosen: Chosen | None,
     repeat: int,
 ) -> None:
-    """Take ``repeat`` decisions in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
+    """Take ``repeat`` decisions in each of ``rows``; without ``actions``, bring loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
     begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is

@@ -14,7 +14,7 @@ from bufgym.jit import kernel, records
 from bufgym.model.buffer import MESSAGE, TOPIC
 from bufgym.sim.decisions import answer_dequeue, answer_send, decide
 from bufgym.sim.senders import Senders
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, LOG_ENTRY, SENDER, SEND, Batch
+from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, LOG_ENTRY, SEND, SENDER, Batch
 from bufgym.sim.transition import next_event
 from bufgym.sim.view import arrival_of, view
 from bufgym.utils.errors import BufgymError
@@ -55,8 +55,8 @@ class Shadows:
     queues, logs and clocks of their own. ``memory`` is the rule's, float64[n, entries].
     """
 
-    def __init__(self, senders: Senders, rule: str, who: str) -> None:
-        """``rule`` is a policy's name; errors begin with ``who`` asks."""
+    def __init__(self, senders: Senders, rule: str | policies.Policy, who: str) -> None:
+        """``rule`` is a policy or its name; errors begin with ``who`` asks."""
         policy = policies.get(rule)
         if (why := _unfit(policy)) is not None:
             raise BufgymError(f"{who}: policy {policy.name!r} {why}")
@@ -95,7 +95,7 @@ class Shadows:
         self.memory[rows] = self._fresh
 
 
-def _unfit(policy: Any) -> str | None:
+def _unfit(policy: policies.Policy) -> str | None:
     """Why no shadow can play ``policy``; None if one can."""
     if not policy.ranked:
         return f"is none that a robot could have instead: {policy.unranked_because}"
