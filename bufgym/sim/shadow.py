@@ -61,7 +61,7 @@ class Shadows:
         if (why := _unfit(policy)) is not None:
             raise BufgymError(f"{who}: policy {policy.name!r} {why}")
         self.policy, self._senders, n = policy, senders, len(senders)
-        self._own = {
+        self._own: dict[str, Any] = {
             "senders": records(n, SENDER),
             "slots": records(senders.batch.slots.shape, MESSAGE),
             "log": records(senders.batch.log.shape, LOG_ENTRY),

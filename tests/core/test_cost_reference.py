@@ -22,7 +22,7 @@ HALF = qoi.exponential(0.5)
 
 def gaps(v: Any, x: Any) -> float:
     """The sum of V over the steps of x, one after another."""
-    return sum(v(b - a) for a, b in itertools.pairwise(x))
+    return float(sum(v(b - a) for a, b in itertools.pairwise(x)))
 
 
 def stands(v: Any, x: Any, kept: Any) -> float:

@@ -81,7 +81,7 @@ def test_an_episode_sums_to_its_qoi_less_a_constant_or_less_the_qoi_of_the_rule(
         over = over | envs.sub_envs.output.terminated
     qois = np.maximum(envs.sub_envs.output.qoi, 1.0)
     values = [episode.value or scenario.value for episode in episodes]
-    limits = {"max_bytes": options.get("max_bytes")}
+    limits: dict[str, Any] = {"max_bytes": options.get("max_bytes")}
     for i, (episode, v) in enumerate(zip(episodes, values, strict=True)):
         x = episode.arrivals["x"]
         constant = 1 + sum(float(v.information(np.array([0.0, d]))) - 1 for d in np.diff(x))
@@ -112,6 +112,7 @@ def test_a_row_is_the_single_environment(mode: str, more: dict[str, Any]) -> Non
     envs = SenderVectorEnv(3, SIZES, L, autoreset_mode=mode, max_episode_steps=9, **options)
     own = gym.wrappers.TimeLimit(SenderEnv(SIZES, L, **{**options, "num_threads": 1}), 9)
     seen, one, over, ends = envs.reset(seed=5)[0], own.reset(seed=6)[0], False, 0
+    mine: Any = 0.0
     rng = np.random.default_rng(0)
     for _ in range(60):
         assert np.array_equal(seen[1], one)
@@ -164,8 +165,8 @@ def test_robots_of_a_cell_learn_from_their_cost() -> None:
     """Each robot's cost sums to its H - 1 less its constant, though they share a link."""
     rows = FleetVecEnv(2, 3, SIZES, L, term="cost", reward="own", actions="candidates", autoreset_mode="SameStep")
     rows.reset(seed=0)
-    senders, total = rows.sub_envs.senders, np.zeros(6)
-    constants = [SIZES.value.information(senders.episodes[i].arrivals["x"]) for i in range(6)]
+    episodes, total = rows.sub_envs.senders.episodes, np.zeros(6)
+    constants = [SIZES.value.information(episode.arrivals["x"]) for episode in episodes if episode is not None]
     over = np.zeros(6, np.bool_)
     while not over.all():
         _, reward, ended, _, info = rows.step(np.random.default_rng(1).integers(3, size=6))
