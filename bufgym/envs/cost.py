@@ -12,8 +12,8 @@ of ``retained``. All of it is known on board.
 rewards of an episode sum to its H less that rule's H.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,92 +40,95 @@ def standing(batch: Batch, i: int, ended: bool) -> float:
     return float(sender.retained_gain + gain_behind(batch, i, sender.occupancy, 0, sender.previous_x))
 
 
-@kernel
-def write_cost(
-    batch: Batch,
-    rows: NDArray[np.int64],
-    robots: int,
-    begins: bool,
-    past: NDArray[np.float64],
-    column: int,
-    output: StepOutput,
-) -> None:
-    """Write ``cost`` of the step that each of ``rows``, cells of so many ``robots``, has just taken.
+class Charged(NamedTuple):
+    """The term ``cost`` of n rows.
 
-    ``past``, float64[n, 3], has what each row stood at, its V(steps), and the arrivals that these are of.
+    Fields:
+        past: float64[n, 3], what each row stood at, its V(steps), and the arrivals that these are of.
+        column: of the term.
     """
-    for c in rows:
-        for i in range(c * robots, (c + 1) * robots):
-            if begins:
-                past[i, :] = 0.0
-                output.reward_terms[i, column] = 0.0
-                continue
-            sender = batch.senders[i]
-            for k in range(max(int(past[i, 2]), 1), sender.next):
-                step = unchecked_at(batch.arrivals, i, k).x - unchecked_at(batch.arrivals, i, k - 1).x
-                past[i, 1] += value(batch.v[sender.v_start :], step)
-            past[i, 2] = sender.next
-            stands = standing(batch, i, output.terminated[i]) - past[i, 1]
-            output.reward_terms[i, column] = stands - past[i, 0]
-            past[i, 0] = stands
-            add_rewards(output, i)
+
+    past: NDArray[np.float64]
+    column: int
+
+
+class Rival(NamedTuple):
+    """The term ``paired`` of n rows, and the shadows it is paired with.
+
+    Fields:
+        above: float64[n], what each row stood at above its shadow.
+        column: of the term.
+        shadows, memory: the arrays of ``Shadows``; the other fields are the rule's functions.
+    """
+
+    above: NDArray[np.float64]
+    column: int
+    shadows: Batch
+    memory: NDArray[np.float64]
+    on_arrival: Any
+    on_departure: Any
+    on_dequeue: Any
+    on_send: Any
+    hears_departures: bool
 
 
 @kernel
-def write_paired(
-    batch: Batch,
-    rows: NDArray[np.int64],
-    begins: bool,
-    past: NDArray[np.float64],
-    column: int,
-    output: StepOutput,
-    shadows: Batch,
-    memory: NDArray[np.float64],
-    on_arrival: Any,
-    on_departure: Any,
-    on_dequeue: Any,
-    on_send: Any,
-    hears_departures: bool,
-) -> None:
-    """Write ``paired`` likewise; ``past``, float64[n], has what each row stood above its shadow."""
-    for i in rows:
-        if begins:
-            past[i] = output.reward_terms[i, column] = 0.0
-            continue
-        ended = output.terminated[i]
-        arrival = batch.senders[i].arrivals if ended else batch.senders[i].next
-        catch_up(shadows, i, arrival, memory, on_arrival, on_departure, on_dequeue, on_send, hears_departures)
-        if ended:
-            settle_gains(shadows, i, True)
-        stands = standing(batch, i, ended) - standing(shadows, i, ended)
-        output.reward_terms[i, column] = stands - past[i]
-        past[i] = stands
-        add_rewards(output, i)
+def write_cost(batch: Batch, i: int, begins: bool, charged: Charged, output: StepOutput) -> None:
+    """Write ``cost`` of the step that row ``i`` has just taken; a row that ``begins`` has cost nothing."""
+    past, column = charged.past, charged.column
+    if begins:
+        past[i, :] = 0.0
+        output.reward_terms[i, column] = 0.0
+        return
+    sender = batch.senders[i]
+    for k in range(max(int(past[i, 2]), 1), sender.next):
+        step = unchecked_at(batch.arrivals, i, k).x - unchecked_at(batch.arrivals, i, k - 1).x
+        past[i, 1] += value(batch.v[sender.v_start :], step)
+    past[i, 2] = sender.next
+    stands = standing(batch, i, output.terminated[i]) - past[i, 1]
+    output.reward_terms[i, column] = stands - past[i, 0]
+    past[i, 0] = stands
+    add_rewards(output, i)
+
+
+@kernel
+def write_paired(batch: Batch, i: int, begins: bool, rival: Rival, output: StepOutput) -> None:
+    """Write ``paired`` likewise; the row's shadow follows."""
+    above, column, shadows = rival.above, rival.column, rival.shadows
+    if begins:
+        above[i] = output.reward_terms[i, column] = 0.0
+        return
+    ended = output.terminated[i]
+    arrival = batch.senders[i].arrivals if ended else batch.senders[i].next
+    catch_up(
+        shadows, i, arrival, rival.memory, rival.on_arrival, rival.on_departure, rival.on_dequeue, rival.on_send,
+        rival.hears_departures,
+    )  # fmt: skip
+    if ended:
+        settle_gains(shadows, i, True)
+    stands = standing(batch, i, ended) - standing(shadows, i, ended)
+    output.reward_terms[i, column] = stands - above[i]
+    above[i] = stands
+    add_rewards(output, i)
 
 
 class Charges:
-    """The terms of this module that an environment names, written for all of its rows after each step."""
+    """The terms of this module that an environment names: ``cost`` and ``rival`` for the kernels, or None."""
 
-    def __init__(self, senders: Senders, names: Sequence[str], reference: str | Policy, robots: int = 1) -> None:
-        """``names`` are those of all terms, by column. ``robots`` share a link each; none has a shadow then."""
-        n, self._senders, self._robots = len(senders), senders, robots
-        self._cost, self._paired = (names.index(name) if name in names else -1 for name in CHARGED)
-        self._of_cost, self._above = np.zeros((n, 3)), np.zeros(n)
-        self.shadows = Shadows(senders, reference, "reward = 'paired'") if self._paired >= 0 else None
+    def __init__(self, senders: Senders, names: Sequence[str], reference: str | Policy) -> None:
+        """``names`` are those of all terms, by column."""
+        n = len(senders)
+        self.cost = Charged(np.zeros((n, 3)), names.index("cost")) if "cost" in names else None
+        self.rival, self._shadows = None, None
+        if "paired" in names:
+            self._shadows = Shadows(senders, reference, "reward = 'paired'")
+            policy, batch = self._shadows.policy, self._shadows.batch
+            functions = (*policy.compiled, policy.hears_departures)
+            self.rival = Rival(np.zeros(n), names.index("paired"), batch, self._shadows.memory, *functions)
 
     def begin(self, rows: NDArray[np.int64]) -> None:
         """Begin the episodes that these rows have just loaded."""
-        if self.shadows is not None:
-            self.shadows.begin(rows)
-
-    def write(self, call: Callable[..., None], rows: NDArray[np.int64], begins: bool, output: StepOutput) -> None:
-        """Write the terms of ``rows``, or of cells, which have begun an episode or taken a step."""
-        batch = self._senders.batch
-        if self._cost >= 0:
-            call(write_cost, batch, rows, self._robots, begins, self._of_cost, self._cost, output)
-        if self.shadows is not None:
-            policy, shadows = self.shadows.policy, self.shadows.batch
-            call(
-                write_paired, batch, rows, begins, self._above, self._paired, output, shadows, self.shadows.memory,
-                *policy.compiled, policy.hears_departures,
-            )  # fmt: skip
+        if self._shadows is not None and self.rival is not None:
+            self._shadows.begin(rows)
+            if self.rival.shadows is not self._shadows.batch:
+                self.rival = self.rival._replace(shadows=self._shadows.batch)

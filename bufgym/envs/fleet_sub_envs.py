@@ -33,11 +33,11 @@ class FleetSubEnvs(SubEnvs):
                 f"reward = {reward!r}: must be 'team' (the mean over the robots) or 'own'; its term is `term`"
             )
         options.check_without_own_link("a cell of robots")
-        self.reward, self.robots = reward, scenario.robots
         super().__init__(cells * scenario.robots, cast(Any, scenario), options)
         for name in ("regret", "paired"):
             if name in self._term_names:
                 raise BufgymError(f"term {name!r}: known for one queue on a link of its own, not for a cell of robots")
+        self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
         self._threads = Threads(np.arange(cells), options.num_threads)
         self._again = [Repeated() for _ in self._threads.parts]
@@ -75,9 +75,8 @@ class FleetSubEnvs(SubEnvs):
             self.output,
             self.choices,
             self.form.named,
+            self._charges.cost,
         )
-        if self._charges is not None:
-            self._charges.write(call, rows, len(actions) == 0, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: each robot's own weighted sum, or for a "team" the mean within its cell."""

@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym.envs.candidates import new_choices
-from bufgym.envs.cost import CHARGED, Charges
+from bufgym.envs.cost import Charges
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
 from bufgym.envs.output import StepOutput
@@ -64,7 +64,6 @@ class SubEnvs:
     """
 
     keeps_slots = False  # whether slot fields are computed even where none is observed
-    robots = 1  # that share a link
 
     def __init__(self, n: int, scenario: Scenario, options: Options) -> None:
         several_topics = bool(scenario.topics)
@@ -109,9 +108,7 @@ class SubEnvs:
         of_steps = tuple(term for term in own_terms if term.name not in APART)
         self._own_terms = OwnTerms(of_steps, len(names) - len(own_terms), n)
         self._regret = Regret(self.senders, names.index("regret")) if "regret" in names else None
-        self._charges = None
-        if any(name in names for name in CHARGED):
-            self._charges = Charges(self.senders, names, options.reference, self.robots)
+        self._charges = Charges(self.senders, names, options.reference)
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
@@ -223,8 +220,7 @@ class SubEnvs:
                     given = numbered(self.scenario, **given)
                 begun.append((i, given, None))
         self.senders.load_all(begun)
-        if self._charges is not None:
-            self._charges.begin(rows)
+        self._charges.begin(rows)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         return rows
@@ -232,10 +228,8 @@ class SubEnvs:
     def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
         call(
             step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named,
-            self.options.repeat,
+            self.options.repeat, self._charges.cost, self._charges.rival,
         )  # fmt: skip
-        if self._charges is not None:
-            self._charges.write(call, rows, len(actions) == 0, self.output)
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

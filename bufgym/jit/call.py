@@ -169,7 +169,7 @@ class Repeated:
     process, remembers none.
     """
 
-    MOST = 32
+    MOST = 16
 
     def __init__(self) -> None:
         self._calls: dict[tuple[int, ...], tuple[Any, Callable[[], Any]]] = {}
