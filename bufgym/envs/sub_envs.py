@@ -177,14 +177,14 @@ class SubEnvs:
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
         loaded = self._load(rows, episodes)
+        if self._regret is not None:
+            self._regret.begin(rows)
         if (same := self._begun.get(len(loaded))) is None:  # a call is repeated with the same arrays
             same = self._begun[len(loaded)] = np.empty_like(loaded)
         same[:] = loaded
         self._run(self._begin, same, NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
-            if self._regret is not None:
-                self._regret.begin(rows, self.output)
             self._own_fields.write(self.senders.batch, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
