@@ -1,10 +1,10 @@
 """The reward ``regret``: how much of the best attainable H each decision gives up.
 
 Let V* be the best H that can still be reached from a state by somebody who knows the whole link and workload. The
-reward of a step is the change of V*, and at the end H takes its place. V*(start) is the clairvoyant's H of the episode,
-and what is lost before the first decision counts in the first step. So the rewards of an episode sum to H - V*(start), and the best policy is the same as under ``retained``: this is reward shaping by a potential
-[ng1999policy]. The luck of link and motion is taken out of the reward. Only the reward sees the future: observations
-and evaluations do not.
+reward of a step is the change of V*, and at the end H takes its place. V*(start) is the clairvoyant's H of the episode;
+what is lost before the first decision counts in the first step. So the rewards of an episode sum to H - V*(start), and
+the best policy is the same as under ``retained``: this is reward shaping by a potential [ng1999policy]. The luck of
+link and motion is taken out of the reward. Only the reward sees the future: observations and evaluations do not.
 """
 
 import numpy as np
