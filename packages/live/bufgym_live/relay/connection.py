@@ -67,7 +67,6 @@ class Connection:
     async def run(self, greeted: Callable[[], None]) -> None:
         """Serve the client to the end; call ``greeted`` after its welcome."""
         hub, caller, admitted = self._hub, self._caller, self._admitted
-        self.session.answers.update(admitted.whys)
         hub.store.acked(self.session, admitted.received)
         hub.join(self)
         self._socket.protocol.max_message_size = hub.config.limits.message_bytes
@@ -249,6 +248,7 @@ class Connection:
             self.tell("stopped", topic=message.topic, id=order(message)["id"])
 
     def _refused(self, refused: RefusedError, topic: str, seq: int, no_drop: bool) -> None:
+        refused = self.session.doubted(refused, seq if no_drop else -1)
         about = {"code": refused.code, "topic": topic, "session": self.session.name}
         first = self._hub.audit.repeated(what="publish", **about, **self._caller.identity.as_json())
         if no_drop or first or refused.code in ("too_late", "stopped") or is_stop(topic):
@@ -324,7 +324,6 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
                 admitted = await kind.greet(caller)
         except TimeoutError:
             raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
-        numbers = admitted.received, admitted.acked
         await hub.store.catch_up(caller.identity, admitted.session, admitted.acked, admitted.received)
         if admitted.robot:
             about = caller.identity, admitted.session, admitted.permissions
@@ -336,8 +335,9 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
         hub.take_over(caller.identity.key, admitted.session)  # before it counts: the old connection may be long dead
         with hub.quotas.connection(caller.identity.key, caller.subscriptions, caller.identity.address) as quota:
             # Nothing is awaited from ``take_over`` to here, or a second connection of the session could come between.
+            numbers = admitted.received, admitted.acked
             session = hub.store.open(admitted.session, caller.identity, admitted.temporary, *numbers)
-            session.heard_s = hub.clock()
+            session.greeted(admitted.open, admitted.whys, hub.clock())
             if admitted.robot:
                 hub.claims.claim(admitted.robot, session)
             stage = "frame"

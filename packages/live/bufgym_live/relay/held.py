@@ -132,17 +132,12 @@ class Held:
                 session.id = None
         return session.id is None
 
-    def remember(self, session: StoredSession, received: int, numbered: int) -> None:
-        """Write a session again, with numbers that are at least these."""
+    def remember(self, session: StoredSession, received: int = 0, numbered: int = 0) -> None:
+        """Write a session as it is now, with numbers that are at least these."""
         session.received, session.numbered = max(session.received, received), max(session.numbered, numbered)
-        if session.id is not None:
+        if session.kept:
             with self.bearable():
                 self._save(session)
-
-    def claimed(self, session: StoredSession) -> None:
-        """Write the robot that a session has claimed to be."""
-        with self.bearable():
-            self._save(session)
 
     def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Note that matching messages are held while the session is away."""
@@ -236,6 +231,7 @@ class Held:
         session.settling, acked = False, session.acked  # read once: the event loop moves it on
         with self.bearable():
             self._settle(session, 0, acked, 0)
+            session.settled = max(session.settled, acked)
             for number in [one for one in list(session.answers) if one <= acked]:
                 session.answers.pop(number, None)
 

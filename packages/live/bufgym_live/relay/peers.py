@@ -37,7 +37,6 @@ _RETRY_S: Final = 1.0
 _CLOCK_S, _CLOCK_TRIES = 0.2, 5  # in which a relay says its time, before a command of it is taken
 _SLOW_SHARE: Final = 0.25  # of late_s, beyond which fewer messages are taken at a time
 _MOST_RELAYS: Final = 1_000
-_MOST_DOUBTFUL: Final = 10_000
 
 
 class Peers:
@@ -56,8 +55,6 @@ class Peers:
         self._bus: Bus | None = None
         self._known: set[str] = set()
         self._delays: defaultdict[str, Delays] = defaultdict(Delays)
-        self._doubtful = dict[str, None]()
-        """Ids of the messages of which NATS has not said whether it has them, in order."""
         self._awake = asyncio.Event()
         self._answers = Answers(hub)
         hub.claims.told = lambda robot, address: self._tell(robot=robot, at=address)
@@ -254,24 +251,21 @@ class Peers:
         """Give a no_drop message to the other relays.
 
         Return whether they may have it, None if NATS does not say whether it has it. Without NATS, they have not, but
-        for what NATS was asked to take before it went away: it may have it, so to refuse it now could be wrong.
+        for what NATS may have been asked to take before, also by this relay's last run: to refuse that could be wrong.
 
         Raises RefusedError: NATS does not take it.
         """
         if not self._goes("receive", message.topic):
             return False
         frame = wire.encode(_undated(message))
-        id = self._id(sender, message)
         if self._bus is None:
-            return None if id in self._doubtful else False
+            return None if message.seq == sender.doubtful else False
+        id = self._id(sender, message)
         put_us = str(time.time_ns() // 1000)
         headers = {"Nats-Msg-Id": id, "Relay": self._settings.name, "Put": put_us, **self._left(message)}
         if not await self._bus.hold(message.topic, frame, headers):
-            self._doubtful[id] = None
-            if len(self._doubtful) > _MOST_DOUBTFUL:
-                del self._doubtful[next(iter(self._doubtful))]
+            sender.doubtful = message.seq
             return None
-        self._doubtful.pop(id, None)
         return True
 
     def _id(self, sender: StoredSession, message: wire.Message) -> str:

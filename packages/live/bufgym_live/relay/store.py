@@ -103,7 +103,7 @@ class Store:
             self.sessions[session.key] = session
         before, session.identity, session.away_s = session.identity, identity, math.inf
         if session.kept and before.as_json() != identity.as_json():
-            self.disk.later(self._held.remember, session, 0, 0)
+            self.disk.later(self._held.remember, session)
         return session
 
     def _free_place(self, sessions: Sequence[StoredSession], most: int) -> None:
@@ -134,7 +134,7 @@ class Store:
         """Note the robot that a session has claimed to be, also for a relay that starts anew."""
         if session.robot != robot or not session.kept:
             session.robot, session.kept = robot, True
-            self.disk.later(self._held.claimed, session)
+            self.disk.later(self._held.remember, session)
 
     async def want(self, session: StoredSession, id: str, pattern: Pattern) -> None:
         """Hold matching messages while the session is away.
@@ -217,7 +217,8 @@ class Store:
             if any(session.held for session in self.sessions.values()):
                 self.disk.soon(0, self._held.expire, now_us, NOT_REACHED)
         for session in list(self.sessions.values()):
-            self.acked(session, session.acked)  # what could not be written before
+            if session.acked > session.settled:
+                self.acked(session, session.acked)  # what could not be written before
             if session.unused_s < self._clock() - self.limits.keep_s:
                 self._expire(session)
 

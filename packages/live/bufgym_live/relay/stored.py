@@ -2,11 +2,13 @@
 
 import hashlib
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from bufgym_live.relay.patterns import Pattern
 from bufgym_live.relay.rules import Identity
+from bufgym_live.relay.wire import RefusedError
 
 NOT_REACHED: Final = "not reached: its robot was away until the deadline"
 UNKNOWN: Final = "nobody knows whether it was executed"
@@ -30,11 +32,27 @@ class StoredSession:
     id: int | None = None  # id on disk, which only the disk's thread reads
     acked: int = 0  # highest number that it has acked
     sent: int = 0  # highest number that a connection of it was given: what it has not acked it may have executed
+    doubtful: int = 0  # number of a message of it of which nobody knows whether other relays have it, or 0
+    settled: int = 0  # highest number up to which acks are written
     settling: bool = False  # whether acks wait to be written
     robot: str = ""  # the robot that it has claimed to be
     heard_s: float = -math.inf  # when its client said something last, by the relay's clock
     answers: dict[int, str] = field(default_factory=dict)  # number of a message for it -> why it was refused
     outcomes: dict[int, "Settled"] = field(default_factory=dict)  # the last messages of it that are settled
+
+    def greeted(self, open: Sequence[int], whys: Mapping[int, str], now_s: float) -> None:
+        """Take the client's hello: of which of its messages it does not know how they ended, and what it refused."""
+        self.answers.update(whys)
+        if self.heard_s == -math.inf and self.received + 1 in open:
+            self.doubtful = self.received + 1  # the relay's last run may have given it to others, and was killed
+        self.heard_s = now_s
+
+    def doubted(self, refused: RefusedError, number: int) -> RefusedError:
+        """Say of a message that is refused whether nobody knows what became of it before."""
+        if number != self.doubtful or refused.code == "busy":
+            return refused
+        self.doubtful = 0
+        return RefusedError(refused.code, f"{refused}: {UNKNOWN}")
 
     @property
     def key(self) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from bufgym.utils.errors import BufgymError
 from bufgym_live.relay import wire
 from bufgym_live.relay.orders import robot_of
+from bufgym_live.relay.stored import UNKNOWN
 
 AGAIN = ("out_of_order", "busy")
 """Codes of refusals after which a message is sent again: it is behind a refused one, or the relay's disk stalls."""
@@ -28,6 +29,7 @@ class Pending:
     answered: asyncio.Future[None]  # done when the relay holds the message; a BufgymError if it was refused
     put_s: float = 0.0  # when it was put, by the client's clock
     withdrawn: bool = False  # whether a stop has withdrawn it
+    sent: bool = False  # whether it was sent, and not refused: the relay may have it
 
 
 class Unanswered:
@@ -78,8 +80,9 @@ class Unanswered:
             try:
                 self._check(message := self._dated(pending.message, pending.put_s))
             except BufgymError as error:
-                _settle(pending, error)
+                _settle(pending, BufgymError(f"{error}: {UNKNOWN}") if pending.sent else error)
             else:
+                pending.sent = True
                 self._sent.append(pending)
                 return message._replace(seq=self.acked + len(self._sent))
         return None
@@ -111,6 +114,7 @@ class Unanswered:
             return
         pending = self._sent.popleft()
         if code in AGAIN:
+            pending.sent = False
             self._again.append(pending)
         else:
             _settle(pending, BufgymError(f"topic {pending.message.topic}: refused: {code}: {why}"))

@@ -3,7 +3,7 @@
 import itertools
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -51,3 +51,12 @@ def corner(server: Any) -> Any:
     from relay_cases import Corner
 
     return Corner(server, next(_NUMBERS))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """The module's browser."""
+    from browser_cases import browsing
+
+    with browsing() as one:
+        yield one

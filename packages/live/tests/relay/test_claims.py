@@ -196,7 +196,9 @@ async def test_a_stop_outlives_relay_and_robot(tmp_path: Path) -> None:
         await stands(operator, robot)
         await operator.release("r", url)
         await until("it is free", lambda: not robot.latch.is_set)
-        await until("it is written", lambda: robot.status()["stops"][0].get("released_by") == "operator")
+        await until(
+            "it is written", lambda: [one.get("released_by") for one in robot.status()["stops"]] == ["operator"]
+        )
 
     async def goes(operator: Session, robot: Robot) -> None:
         await operator.command("/robots/r/command", {"command": "goal", "id": "g"})

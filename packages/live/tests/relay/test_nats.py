@@ -162,6 +162,37 @@ async def test_a_command_whose_answer_was_lost_arrives_once(tmp_path: Path, monk
             assert await nothing(one)
 
 
+async def test_a_relay_that_ends_before_the_answer_does_not_refuse_what_nats_may_have(tmp_path: Path) -> None:
+    """It starts alone, while NATS stands still; the client says which of its commands have no answer.
+
+    Said again in time, the command waits for NATS; once its deadline is over, nobody knows whether it was executed: it
+    was, since NATS had read it.
+    """
+    port, command = free_port("127.0.0.1"), "/robots/a/command"
+    async with nats_server(port, tmp_path) as server, shared(port, "b") as b, client(b.port) as one:
+        await one.subscribe("^/robots/a/")
+        async with shared(port, "a") as a, client(a.port, session="operator") as operator:
+            await still(server)
+            await operator.command(1, command, stamp_us=1)
+            with pytest.raises(Exception, match="NATS does not answer"):
+                await operator.next()
+        async with shared(port, "a") as a, client(a.port, session="other") as other:
+            await other.command(1, command, stamp_us=1)
+            assert (await other.next())["code"] == "no_receiver"
+            async with client(a.port, session="operator", open=[1]) as operator:
+                await operator.command(1, command, stamp_us=1)
+                with pytest.raises(Exception, match="NATS does not answer"):
+                    await operator.next()
+            async with client(a.port, session="operator", open=[1]) as operator:
+                await operator.command(1, command, stamp_us=1, until_us=1)
+                why = (await operator.next())["why"]
+                assert "after its deadline" in why and why.endswith("nobody knows whether it was executed")
+                await operator.command(1, command, stamp_us=2)  # another one, of which all is known
+                assert (await operator.next())["code"] == "no_receiver"
+        server.send_signal(signal.SIGCONT)
+        await one.came(1)
+
+
 async def test_a_wrong_password_ends_the_start_at_once_and_is_not_told(tmp_path: Path) -> None:
     port = free_port("127.0.0.1")
     async with nats_server(port, tmp_path, "--user", "west", "--pass", "r#ght"):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -59,12 +59,6 @@ def port(tmp_path: Path) -> Iterator[int]:
     """Of a relay for one test: what a test adds, the relay keeps."""
     with recorded(tmp_path) as number:
         yield number
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 def until(page: Any, *expressions: str) -> None:

@@ -1,11 +1,10 @@
 """Alerts of the page: the worst on top of many, also while a recording plays, and said calmly to who cannot see."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -33,12 +32,6 @@ class Slow(Fleet):
     """Each robot says its status once a second."""
 
     every_s = 1.0
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 def names(page: Any, selector: str) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import beside, compiled
 from needs import needs
 
@@ -92,12 +92,6 @@ def stage() -> Iterator[Stage]:
     one.do(one.over.set)
     one.thread.join(60)
     assert not one.thread.is_alive(), "waited 60 s for a relay's end"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 STATE, COMMAND = text("#state"), text("#command-status")

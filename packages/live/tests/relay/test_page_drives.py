@@ -2,11 +2,10 @@
 
 import asyncio
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -21,12 +20,6 @@ from bufgym_live.relay.config import Rule  # noqa: E402
 from bufgym_live.relay.drive import Drive  # noqa: E402
 
 pytestmark = compiled
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 SLEEPS = """

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -39,12 +39,6 @@ COUNT = """([red, green, blue]) => {
 }"""
 ORANGE, WALL = (f"({COUNT})({colour})" for colour in ("[255, 128, 0]", "[140, 150, 163]"))
 """How many pixels of the map have the colour of the markers, and of the walls of a grid."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 @pytest.fixture(params=WIDTHS)

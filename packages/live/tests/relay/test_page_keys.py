@@ -4,11 +4,10 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -58,12 +57,6 @@ class Yard(Fleet):
                     self.stops.append(time.monotonic())
                     for status, _ in self.robots.values():
                         status["stops"] = json.loads(bytes(said.payload))["stops"]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 def press(devtools: Any, code: str, key: str, *kinds: str, **fields: Any) -> None:

@@ -1,11 +1,10 @@
 """What an operator looks for: who is silent, who is near whom, what a robot does, a stop for all, a goal by keys."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from browser_cases import browsing, shows
+from browser_cases import shows
 from loop_cases import compiled
 from needs import needs
 
@@ -17,12 +16,6 @@ from test_page import until  # noqa: E402
 from test_page_fleet import PLACE, text  # noqa: E402
 
 pytestmark = compiled
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 def card(name: str, part: str) -> str:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser_cases import browsing
 from loop_cases import compiled
 from needs import needs
 
@@ -23,12 +22,6 @@ pytestmark = compiled
 RULES = tuple(Rule(email=f"{name}@x.org", send=True, receive=True) for name in ("anna", "fleet"))
 SIGNED_IN, ASKED = "#state:text-is('live') ~ #you:text-is('you are anna@x.org')", "#ask[open]"
 TOKEN = "sessionStorage.getItem('token')"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with browsing() as one:
-        yield one
 
 
 @pytest.fixture

@@ -72,6 +72,25 @@ async def test_after_a_reconnect_what_the_relay_lacks_goes_again() -> None:
         await futures[3]
 
 
+async def test_a_command_that_was_sent_and_is_late_after_a_break_may_have_been_executed() -> None:
+    """Two were put before the break, of which one was sent; of that one nobody knows."""
+    late = False
+
+    def dated(message: Message, put_s: float) -> Message:
+        if late:
+            raise BufgymError("too late")
+        return message
+
+    unanswered = Unanswered(dated)
+    sent, waited = (unanswered.put(Message("/a", name)) for name in (b"sent", b"waited"))
+    assert unanswered.next() is not None and unanswered.next() is None
+    late = True
+    unanswered.resume(received=0, window=1)
+    assert unanswered.next() is None
+    assert str(sent.exception()) == "too late: nobody knows whether it was executed"
+    assert str(waited.exception()) == "too late"
+
+
 @contextlib.asynccontextmanager
 async def links(corner: Corner, count: int) -> AsyncIterator[list[Any]]:
     """Links of 10 MB/s to the relay, and the URLs where they begin."""
