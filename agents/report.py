@@ -103,7 +103,8 @@ def keep(trained: Trained, report: Callable[[Trained], Report]) -> None:
     write_notes(folder, trained.settings, seeds, notes)
     seconds = ", ".join(f"{run.seconds:.0f}" for way in (trained, *trained.beside) for run in way.runs)
     print(f"\ntraining took {seconds} s; {contents} are in {folder}")
-    print("\n".join(["next:", *NEXT]).format(model=folder / best.model.name))
+    then = NEXT_OF_FLEET if trained.settings.kind == "fleet" else NEXT
+    print("\n".join(["next:", *then]).format(model=folder / best.model.name))
 
 
 def agent_name(run: Run) -> str:
@@ -117,6 +118,7 @@ NEXT = (
     "  bufgym export {model} mine.safetensors --name mine",
 )
 """What to do with a model."""
+NEXT_OF_FLEET = ("  bufgym fleet --policies {model},learned,afr   # compare it in other cells", NEXT[-1])
 
 Report = tuple[list[int], dict[str, Any], str]
 """The seeds and scores for the notes of the kept agent, and what the folder holds."""

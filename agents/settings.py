@@ -131,8 +131,9 @@ class SingleDecisions(Settings):
     kinds = ("environment", "queue", "fleet")
     steps: Natural = 200_000
     """Decisions to learn from, for each seed."""
-    reward: Literal["regret", "retained", "delivered"] = "regret"
-    """regret knows the future, which only the reward does; it needs messages of equal size, and no fleet."""
+    reward: Literal["regret", "paired", "cost", "retained"] = "regret"
+    """regret knows the future, which only the reward does; it needs messages of equal size, and no fleet. paired is for
+    any sizes, and no fleet either."""
     candidates: Count = 2
     """k: how many of the cheapest candidates the agent chooses among, beside the head."""
     width: Count = 64
@@ -148,10 +149,10 @@ class SingleDecisions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.kind == "fleet" and self.reward == "regret":
+        if self.kind == "fleet" and self.reward in ("regret", "paired"):
             raise BufgymError(
-                f"suite {self.suites.suite[0]}: nobody knows the regret of robots that share a link: give --reward "
-                "retained --gamma 0.5"
+                f"suite {self.suites.suite[0]}: nobody knows the {self.reward} of robots that share a link: give "
+                "--reward retained --gamma 0.5"
             )
         if self.width > MAX_WIDTH:
             raise BufgymError(f"width = {self.width}: a file of weights has at most {MAX_WIDTH} hidden units a layer")

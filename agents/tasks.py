@@ -101,10 +101,10 @@ class Families:
 class Place:
     """What a rule is tuned on."""
 
-    on: str = "lte"
-    """A scenario or a suite: a name (bufgym list), with parameters as in lte:rate_hz=5, or a client's .toml."""
+    on: str = ""
+    """A scenario or a suite (default: lte): a name (bufgym list), as in lte:rate_hz=5, or a client's .toml."""
     workload: str | None = None
-    """A recording of a robot's messages in place of the scenario's stream, as in bench."""
+    """A recording of a robot's messages in place of a scenario, as in bench."""
     trace: Names = ()
     """Bandwidth traces for it, as in bench (default: shipped LTE)."""
     data: str | None = None
@@ -113,8 +113,12 @@ class Place:
     """L, such as 5,10,25 (default: 8, with topics 32, or the suite's)."""
 
     def __post_init__(self) -> None:
+        if not self.on and self.workload is None:
+            object.__setattr__(self, "on", "lte")
         is_suite = self.on in suites.SUITES
         if is_suite and (self.workload is not None or self.trace):
             raise BufgymError(f"suite {self.on}: has streams and links of its own, so no --workload and no --trace")
         if self.data is not None and (not is_suite or self.workload is not None):
             raise BufgymError("--data is of a suite, which --on names")
+        if self.on and self.workload is not None:
+            raise BufgymError(f"--workload {self.workload} takes the place of --on {self.on}: must be one of them")

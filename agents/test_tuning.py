@@ -71,6 +71,8 @@ def test_options_that_a_place_has_no_use_for_are_refused() -> None:
     nobodys = "--data is of a suite, which --on names"
     refuse(nobodys, Place, data="recordings")
     refuse(nobodys, Place, workload="drive.csv", data="recordings")
+    refuse("--workload drive.csv takes the place of --on lte: must be one", Place, "lte", workload="drive.csv")
+    assert (Place().on, Place(workload="drive.csv").on) == ("lte", "")
     assert Place("lte-belgium-v1", data="recordings").data == "recordings"
 
 

@@ -112,7 +112,7 @@ def tune(settings: Tune) -> Policy:
     if (task.kind == "topics") != rule.for_topics:
         of = "a scheduler of several topics" if rule.for_topics else "a drop rule of one queue"
         has = "several topics" if task.kind == "topics" else "one queue"
-        raise BufgymError(f"policy {rule.name}: is {of}, and {settings.place.on} has {has}")
+        raise BufgymError(f"policy {rule.name}: is {of}, and {settings.place.on or settings.place.workload} has {has}")
     folder = prepare(settings)
     try:
         with locked(folder):

@@ -46,9 +46,10 @@ def _step(batch: Any, rows: int) -> None:
 
 def _environments() -> None:
     slots: dict[str, Any] = {"actions": "slots"}
+    ordered: tuple[dict[str, Any], ...] = ({}, {"bound": True}, {"reward": "cost"}, {"reward": "paired"})
     for name, short in _SHORT.items():
-        for options in ({}, {"bound": True}, slots, {**slots, "fields": _FIELDS}, {**slots, "fields": "compact"}):
-            if name == "topics" and (not options or "bound" in options):
+        for options in (*ordered, slots, {**slots, "fields": _FIELDS}, {**slots, "fields": "compact"}):
+            if name == "topics" and options in ordered:
                 continue
             batch = SenderVectorEnv(2, name, _L, **short, **options)
             _step(batch, 2)

@@ -1,4 +1,4 @@
-// A relay's client in JavaScript, written from docs/guide/relay-wire.md alone. Needs Node 22, or a browser's WebSocket.
+// A relay client in JavaScript, written from packages/live/bufgym_live/relay/PROTOCOL.md alone. Needs Node 22, or a browser.
 //
 //     node relay_client.js ws://127.0.0.1:7420 NAME [TOPIC JSON]
 // Prints what robots publish, publishes the time as /robots/NAME/clock, and sends one no_drop command, if given.

@@ -95,18 +95,19 @@ SAID = 16
 
 
 class Plan(NamedTuple):
-    """Runs that the planner plays: on the first ``links`` links of a family, the first seeds of each."""
+    """Runs that the planner plays: on the first ``links`` links of a family, the first seeds of each, at one L."""
 
     family: str
     planning: Planning
     links: int
     seeds: int
+    capacity: int
 
 
 PLANS = {
-    "task, told the end": Plan("task", Planning(32, 20.0, True), 16, 2),
-    "task": Plan("task", Planning(32, 20.0, False), 16, 2),
-    "lte": Plan("lte", Planning(32, 8.0, False), 12, 1),
+    "task, told the end": Plan("task", Planning(32, 20.0, True), 16, 2, 8),
+    "task": Plan("task", Planning(32, 20.0, False), 16, 2, 8),
+    "lte, L = 5": Plan("lte", Planning(32, 8.0, False), 12, 1, 5),
 }
 """Futures, how far they reach, and whether the end is told."""
 
@@ -120,7 +121,8 @@ def planned(
             continue
         seeds = families.FAMILIES[plan.family].seeds
         near = set(list(dict.fromkeys(run["link"] for run in runs[plan.family]))[: plan.links])
-        chosen = [run for k, run in enumerate(runs[plan.family]) if run["link"] in near and k % seeds < plan.seeds]
+        first = [run for k, run in enumerate(runs[plan.family]) if k % seeds < plan.seeds]
+        chosen = [run for run in first if run["link"] in near and run["capacity"] == plan.capacity]
         links = prior(LAWS[plan.family], np.random.default_rng(0))
 
         h = np.empty(len(chosen))

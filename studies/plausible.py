@@ -25,7 +25,6 @@ RULES = {
     "jumps": "no robot is faster",
     "samples of one time": "share a time",
     "slow samples": "in another unit",
-    "distant messages": "the other .*, which take",
     "unit of poses": "times are taken as|its header says",
 }
 """Rule -> what its warning says."""

@@ -1,17 +1,20 @@
 """How far the trainers of stable-baselines3 come by their own defaults: the curves of docs/guide/trainers.md.
 
 python -m studies.sb3_defaults --trainers PPO DQN A2C MaskablePPO --reward regret --steps 200000
+python -m studies.sb3_defaults --reward paired --repeat 3 --rows 8 --seeds 0 1 2 3 4 5 6 7 8 9 --steps 300000
 python -m studies.sb3_defaults --curves studies/sb3_defaults.csv --figure docs/figures/sb3-defaults.svg
 
 No hyperparameter is set, of the trainer or the environment, but for those that a command names. The score is that of
 the most likely actions on fixed episodes that training does not draw, 0 for Drop Oldest and 1 for the clairvoyant. Each
-evaluation is a line of the file of curves at once, so that a run cut short keeps what it had; runs that are complete in
-the file are not made again.
+evaluation is a line of the file of curves at once, so that a run cut short shows what it had. The same command goes on
+where it was cut: a seed that is complete in the file stays, one that was cut is made anew. An action that holds for
+several decisions does so in training alone; every decision is scored.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import math
 import time
 from collections.abc import Sequence
@@ -35,6 +38,7 @@ from bufgym.sb3 import make_vec_env, takes_masks
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
+from bufgym.utils.files import write_text
 from studies.page import command, table
 
 TRAINERS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "A2C": A2C, "MaskablePPO": MaskablePPO}
@@ -70,6 +74,7 @@ class Run:
     rows: int
     task: str
     capacity: int
+    repeat: int = 1
     seed: int = field(compare=False, default=0)
 
     @property
@@ -77,6 +82,7 @@ class Run:
         """Everything but the seed, as far as it is not usual."""
         unusual = [f"{self.rows} rows"] * (self.rows != 1) + [self.task] * (self.task != "lte")
         unusual += [f"L = {self.capacity}"] * (self.capacity != 8) + [self.actions] * (self.actions != "candidates")
+        unusual += [f"held for {self.repeat}"] * (self.repeat != 1)
         return ", ".join([self.trainer, self.reward, *unusual])
 
 
@@ -158,12 +164,13 @@ def append(out: Path, header: Sequence[str], line: Sequence[Any]) -> None:
     """Append a line to a CSV file, which begins with its header."""
     begins = not out.exists()
     with out.open("a", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([header] * begins + [line])
+        csv.writer(file, lineterminator="\n").writerows([header] * begins + [line])
 
 
 def train(run: Run, task: Task, steps: int, curve: Curve) -> None:
     """Train one seed with the trainer's defaults."""
     settings: dict[str, Any] = {"actions": run.actions, "observation": "flat", "info": "mask", "reward": run.reward}
+    settings["repeat"] = run.repeat
     envs = make_vec_env(task.env, run.rows, capacity=run.capacity, **settings, **task.training)
     TRAINERS[run.trainer]("MlpPolicy", envs, seed=run.seed, device="cpu").learn(steps, curve)
     curve.write()
@@ -179,12 +186,26 @@ def read(curves: Path) -> dict[Run, dict[int, list[Point]]]:
     found: dict[Run, dict[int, list[Point]]] = {}
     with curves.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            whole = (int(line[name]) for name in ("rows", "capacity", "seed"))
-            rows, capacity, seed = whole
-            run = Run(line["trainer"], line["reward"], line["actions"], rows, line["task"], capacity, seed)
+            run = run_of(line)
             point = (int(line["steps"]), float(line["score"]), float(line["cpu_s"]))
-            found.setdefault(run, {}).setdefault(seed, []).append(point)
+            found.setdefault(run, {}).setdefault(run.seed, []).append(point)
     return found
+
+
+def run_of(line: dict[str, str]) -> Run:
+    """The run that a line of the file of curves is about."""
+    numbers = {name: int(line[name]) for name in ("rows", "capacity", "repeat", "seed")}
+    return Run(**{name: line[name] for name in ("trainer", "reward", "actions", "task")}, **numbers)  # type: ignore[arg-type]
+
+
+def forget(curves: Path, run: Run) -> None:
+    """Take the lines of this seed, which was cut, out of the file."""
+    with curves.open(newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    kept = [line for line in lines if (run_of(line), int(line["seed"])) != (run, run.seed)]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([LINE, *(line.values() for line in kept)])
+    write_text(curves, text.getvalue())
 
 
 def summary(curves: Path, steps: int) -> list[str]:
@@ -225,6 +246,7 @@ def page(
     rows: int = 1,
     task: str = "lte",
     capacity: int = 8,
+    repeat: int = 1,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     steps: int = 100_000,
     every: int = 10_000,
@@ -246,9 +268,11 @@ def page(
     curves.parent.mkdir(exist_ok=True)
     for seed in seeds:
         for trainer in trainers:
-            one = Run(trainer, reward, actions, rows, task, capacity, seed)
+            one = Run(trainer, reward, actions, rows, task, capacity, repeat, seed)
             done = read(curves).get(one, {}).get(seed, []) if curves.exists() else []
             if not any(reached >= steps for reached, *_ in done):
+                if done:
+                    forget(curves, one)
                 train(one, of_task, steps, Curve(fixed, one, every, curves))
 
 

@@ -209,7 +209,7 @@ def test_the_planner_plays_some_runs_once(tmp_path: Path, monkeypatch: Patch) ->
     streams = [Place(f"{k}", moving(link, 2_000_000), 4) for k, link in enumerate(links)]
     maker = Maker(lambda: streams, 2)
     monkeypatch.setitem(families.FAMILIES, "lte", maker)
-    plan = judging.Plan("lte", causal_planner.Planning(8, 6.0, True), 2, 1)
+    plan = judging.Plan("lte", causal_planner.Planning(8, 6.0, True), 2, 1, 4)
     monkeypatch.setattr(judging, "PLANS", {"lte": plan, "task": plan._replace(family="task")})
     runs = {"lte": families.bounded("lte", maker, tmp_path)}
     (row,) = judging.planned(runs, tmp_path, judging.rules())

@@ -120,7 +120,9 @@ def page(id: str) -> str:
     kind: Any = _class(id)
     parts = sections(inspect.getdoc(kind) or "")
     topics, one_queue = id == "bufgym/Topics-v0", id not in ("bufgym/Topics-v0", FLEET)
-    more: tuple[RewardTerm, ...] = TOPIC_REWARD_TERMS if topics else (OWN_TERMS["regret"],) if one_queue else ()
+    more: tuple[RewardTerm, ...] = TOPIC_REWARD_TERMS
+    if not topics:
+        more = tuple(OWN_TERMS[name] for name in (("cost", "paired", "regret") if one_queue else ("cost",)))
     intro = TOPICS if topics else parts[""]
     lines = [f"# {title(id)}", f"{about(id)[0].upper()}{about(id)[1:]}.", *_films(id), code(intro), _make(id)]
     if id == FLEET:

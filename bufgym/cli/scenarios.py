@@ -74,6 +74,23 @@ class WorkloadOptions(RecordingOptions):
     workload: list[str] | None = None
     """MCAP, ROS 1 bag, rosbag2 (extra 'ros') or CSV; several are one drive; alone, played once from the start of each
     trace."""
+    columns: list[str] | None = None
+    """Of any other table: the columns of times, of bytes and, if there is one, of topics, by name or number."""
+    time_unit: str | None = None
+    """Of its times: s, ms, us, ns (default: that in the column's name, else s)."""
+
+    def arguments(self) -> dict[str, Any]:
+        """Collect those given for ``read_workload``."""
+        if self.columns is None:
+            refuse(given(self, "time_unit"), "needs --columns")
+            return super().arguments()
+        from bufgym.traces import Columns
+
+        if len(self.columns) not in (2, 3):
+            raise BufgymError(f"--columns {' '.join(self.columns)}: must be TIME BYTES or TIME BYTES TOPIC")
+        time, size, topic = [*self.columns, ""][:3]
+        chosen = Columns(time, bytes=size, topic=topic, time_unit=self.time_unit or "")
+        return {**super().arguments(), "columns": chosen}
 
 
 @Parameter(name="*", group=Group.create_ordered("One interruption of unknown length T instead"))
@@ -160,7 +177,7 @@ class ScenarioOptions:
         refuse(law, "needs --interruption")
         if workload.workload is not None:
             return recorded(workload.workload, stream, workload, seeds)
-        refuse(given(workload, "topics", "odom", "bridge_gaps"), "needs --workload")
+        refuse(given(workload, "topics", "odom", "bridge_gaps", "columns", "time_unit"), "needs --workload")
         if stream.motion is None:
             refuse(given(workload, *MOTION), "needs --motion, or --workload with --odom")
         return _uplink(stream, workload)

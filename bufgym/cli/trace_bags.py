@@ -155,11 +155,11 @@ def from_poses(
         bridge_gaps: Write it in spite of gaps.
         out: Write the motion to this CSV file (t_s,motion).
     """
-    from bufgym.traces import PoseColumns, read_motion, write_motion_csv
+    from bufgym.traces import Columns, read_motion, write_motion_csv
 
     if (time is None) != (pose is None):
         raise BufgymError("--time and --pose go together")
-    chosen = None if time is None or pose is None else PoseColumns(time, tuple(pose), time_unit)
+    chosen = None if time is None or pose is None else Columns(time, pose=tuple(pose), time_unit=time_unit)
     with bar(None, True, "line") as advance:
         motion = read_motion(file, measured.settings(), format=format, times=times, columns=chosen, advance=advance)
     seconds = motion.duration_us / 1e6

@@ -57,6 +57,14 @@ def candidate_decision(batch: Batch, i: int, action: int, choices: Choices) -> i
 
 
 @kernel
+def renew_candidates(batch: Batch, i: int, choices: Choices) -> None:
+    """Find the candidates of row ``i`` where a decision is due that is not shown."""
+    places = choices.order.shape[1]
+    order, cost = unchecked_slice(choices.order, i, 0, places), unchecked_slice(choices.cost, i, 0, places)
+    find_candidates(view(batch, i), arrival_of(batch, i), order, cost)
+
+
+@kernel
 def write_candidates(batch: Batch, i: int, ended: bool, output: StepOutput, choices: Choices) -> None:
     """Write row ``i``'s state, candidates, action mask and observation.
 

@@ -34,8 +34,9 @@ class FleetSubEnvs(SubEnvs):
             )
         options.check_without_own_link("a cell of robots")
         super().__init__(cells * scenario.robots, cast(Any, scenario), options)
-        if self._regret is not None:
-            raise BufgymError("term 'regret': known for one queue on a link of its own, not for a cell of robots")
+        for name in ("regret", "paired"):
+            if name in self._term_names:
+                raise BufgymError(f"term {name!r}: known for one queue on a link of its own, not for a cell of robots")
         self.reward, self.robots = reward, scenario.robots
         self.fleet = Fleet(self.senders, scenario.robots)
         self._threads = Threads(np.arange(cells), options.num_threads)
@@ -74,6 +75,7 @@ class FleetSubEnvs(SubEnvs):
             self.output,
             self.choices,
             self.form.named,
+            self._charges.cost,
         )
 
     def rewards(self) -> NDArray[np.float64]:

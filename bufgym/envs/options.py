@@ -11,6 +11,7 @@ from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
 from bufgym.model.checks import above_0, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
+from bufgym.policies import Policy
 from bufgym.scenario import Scenario
 from bufgym.scenario.registry import parameters
 from bufgym.utils.errors import BufgymError, UnknownArgumentError, unknown
@@ -51,9 +52,11 @@ class Options:
     max_bytes: int | None = None
     decide_at: str | None = None
     reward: str | Mapping[str, float] = "retained"
+    reference: str | Policy = "min-motion-gap"
     reward_scale: float | str | None = None
     actions: str = CANDIDATES
     candidates: int = 2
+    repeat: int = 1
     fields: str | Sequence[str] | None = None
     observation: str | None = None
     info: str = "full"
@@ -71,6 +74,9 @@ class Options:
         if not isinstance(self.actions, str) or self.actions not in ACTIONS:
             raise unknown("actions", str(self.actions), ACTIONS)
         whole("candidates", self.candidates, 1, MOST_CANDIDATES)
+        whole("repeat", self.repeat, 1)
+        if self.repeat > 1 and not self.acts_on_candidates:
+            raise BufgymError(f"repeat = {self.repeat}: for candidates, whose order an action keeps; not for slots")
         if self.acts_on_candidates and self.fields == "compact":
             raise BufgymError(f"fields = 'compact': is for actions = 'slots'; {CANDIDATES!r} have fields of their own")
         names: Any = () if self.fields in (None, "compact") else self.fields
@@ -144,6 +150,8 @@ class Options:
             raise BufgymError(
                 f"bound = True: the clairvoyant is known for one queue on a link of its own, not for {what}"
             )
+        if self.repeat > 1:
+            raise BufgymError(f"repeat = {self.repeat}: for one queue on a link of its own, not for {what}")
 
     def check_without_own_queue(self, what: str) -> None:
         """The same, and refuse candidates, which are of one queue."""

@@ -100,8 +100,15 @@ def write_rewards(batch: Batch, i: int, begins: bool, rewarded: NDArray[np.float
         terms[i, AGE] = (rewarded[i, AGE] - sender.aged) / sender.weight
         terms[i, LATE] = (rewarded[i, LATE] - sender.late) / sender.weight
         rewarded[i, AGE], rewarded[i, LATE] = sender.aged, sender.late
+    add_rewards(output, i)
+
+
+@kernel
+def add_rewards(output: StepOutput, i: int) -> None:
+    """Add the weighted terms of row ``i`` up."""
+    output.rewards[i] = 0.0
     for k in range(len(output.weights)):
-        output.rewards[i] += output.weights[k] * terms[i, k]
+        output.rewards[i] += output.weights[k] * output.reward_terms[i, k]
 
 
 @kernel

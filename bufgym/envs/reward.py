@@ -5,9 +5,13 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from bufgym.envs.cost import CHARGED
 from bufgym.model.checks import is_number
 from bufgym.model.observe import OWN_TERMS, OwnTerm, own_term, terms_for
 from bufgym.utils.errors import BufgymError, unknown
+
+APART = (*CHARGED, "regret")
+"""Terms outside the tables that whole modules compute; theirs are the last columns, in this order."""
 
 
 def reward_weights(
@@ -22,8 +26,7 @@ def reward_weights(
     if not weights:
         raise BufgymError(f"reward = {reward!r}: give at least one term its weight; known: {', '.join(known)}")
     own: dict[str, OwnTerm] = {}
-    # ``regret`` is the last column: it is computed apart.
-    for name, weight in sorted(weights.items(), key=lambda pair: pair[0] == "regret"):
+    for name, weight in sorted(weights.items(), key=lambda pair: APART.index(pair[0]) if pair[0] in APART else -1):
         if not (is_number(weight) and np.isfinite(weight)):
             raise BufgymError(f"reward = {reward!r}: the weight of {name!r} must be a finite number")
         if name in tables:

@@ -48,6 +48,11 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     Over an episode both ``delivered`` and ``retained`` add up to H - 1, or to 0 if nothing was delivered. The default
     is ``retained``, which charges a drop at once.
 
+    ``cost`` leaves out of ``retained`` what arrivals bring whatever one does, and charges the gap behind the last
+    message kept as it grows. It adds up to H - 1 less a constant of the episode, the sum of V over all steps in x, and
+    needs nothing that a robot lacks. ``paired`` is ``cost`` less that of the rule ``reference`` on the same episode. It
+    adds up to H less that rule's H, where H counts as 1 if nothing was delivered. ``bufgym.envs.cost`` has both.
+
     ``regret`` is the change of V*, the best H that can still be reached. It adds up to H - V*(start), so the best
     policy stays the same, and the luck of link and motion is taken out. V* needs the link's future. Only the reward
     sees that future: observations and evaluations never do. It serves one queue of messages of equal size.
@@ -92,13 +97,16 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     - ``max_bytes``: B, bytes, by default without limit.
     - ``actions``: "candidates", the default of one queue; or "slots", the only one of several topics.
     - ``candidates``: how many of the cheapest candidates are actions beside the head, 1 to 64.
+    - ``repeat``: an action holds for so many decisions, by default 1. At each of them its place in the order of
+      candidates is looked up anew. Rewards add up over them, and an episode's end cuts them short. For candidates.
     - ``decide_at``: "overflow" asks only when the buffer is full, "arrival" at every arrival. Candidates are asked at
       overflow by default, slots at arrivals.
     - ``observation``: "flat", the default of candidates; "dict", the default of slots; or "slots".
     - ``fields``: with candidates, names of fields to observe beside the 27 numbers, your own or those of
       ``ON_BOARD_FIELDS``. With slots, names of the fields to observe, by default all of the tables; "compact" means all
       of the context's.
-    - ``reward``: a term's name, or weights by name; ``regret`` and terms of your own take part only if named.
+    - ``reward``: a term's name, or weights by name; terms outside ``REWARD_TERMS`` take part only if named.
+    - ``reference``: the rule of ``paired``, a compiled policy or its name; "min-motion-gap" always drops the cheapest.
     - ``reward_scale``: factor on the reward, by default none. "episode" is the constant ``reward_scale`` of the
       scenario's class, which brings a rule's return in a default episode between 1 and 10; weights of your own terms
       stay as they are. ``info["reward_terms"]`` is not scaled.

@@ -9,7 +9,8 @@ as both run the same code.
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.candidates import Choices, candidate_decision, write_candidates
+from bufgym.envs.candidates import Choices, candidate_decision, renew_candidates, write_candidates
+from bufgym.envs.cost import Charged, Rival, write_cost, write_paired
 from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
 from bufgym.jit import kernel, prefetch
 from bufgym.model.buffer import HOLD
@@ -59,12 +60,17 @@ def step_rows(
     output: StepOutput,
     choices: Choices | None,
     chosen: Chosen | None,
+    repeat: int,
+    charged: Charged | None,
+    rival: Rival | None,
 ) -> None:
-    """Take one decision in each of ``rows``; without ``actions``, bring freshly loaded rows to their first decision.
+    """Take ``repeat`` decisions in each of ``rows``; without ``actions``, bring loaded rows to their first decision.
 
     ``actions`` is int64[n], by row. ``rewarded``, float64[n, reward terms], sums the rewards of the episode so far and
     begins with zeros. A row without a decision due has ended, or asked for none; it reports its end. ``choices`` is
-    None where actions are no candidates, ``chosen`` where no built-in fields are named.
+    None where actions are no candidates, ``chosen`` where no built-in fields are named. An action among candidates
+    holds for ``repeat`` decisions: its place in their order, which each decision has anew. ``charged`` and
+    ``rival`` are the terms of ``bufgym.envs.cost``, or None.
     """
     begins, last = len(actions) == 0, len(rows) - 1
     for r in range(len(rows)):
@@ -83,8 +89,18 @@ def step_rows(
             answer_send(batch, i, HOLD if actions[i] == sender.capacity else actions[i])
         if begins or asks != NOTHING_WAITS:
             advance(batch, i)
+        if choices is not None and not begins:
+            for _ in range(1, repeat):
+                if sender.waiting == ARRIVAL_WAITS:
+                    renew_candidates(batch, i, choices)
+                    carry_out(batch, i, actions[i], choices)
+                    advance(batch, i)
         write_rewards(batch, i, begins, rewarded, output)
         show(batch, i, sender.waiting == NOTHING_WAITS, output, choices, chosen)
+        if charged is not None:
+            write_cost(batch, i, begins, charged, output)
+        if rival is not None:
+            write_paired(batch, i, begins, rival, output)
         if chosen is not None:
             write_named(batch, i, chosen, output.flat)
 
@@ -125,6 +141,7 @@ def step_cells(
     output: StepOutput,
     choices: Choices | None,
     chosen: Chosen | None,
+    charged: Charged | None,
 ) -> None:
     """Take every decision that is due in ``cells``, or bring cells to their first tick, as ``step_rows`` does.
 
@@ -147,5 +164,7 @@ def step_cells(
         for i in range(first, first + robots):
             write_rewards(batch, i, begins, rewarded, output)
             show(batch, i, ended, output, choices, None)
+            if charged is not None:
+                write_cost(batch, i, begins, charged, output)
             if chosen is not None:
                 write_named(batch, i, chosen, output.flat)

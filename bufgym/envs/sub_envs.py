@@ -14,12 +14,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from bufgym.envs.candidates import new_choices
+from bufgym.envs.cost import Charges
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
 from bufgym.envs.output import StepOutput
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.regret import Regret
-from bufgym.envs.reward import reward_weights
+from bufgym.envs.reward import APART, reward_weights
 from bufgym.envs.step import step_rows
 from bufgym.jit import Repeated
 from bufgym.model.observe import (
@@ -102,17 +103,18 @@ class SubEnvs:
         self.terms = terms_for(several_topics) + own_terms
         scaled = len(self.terms) - len(own_terms) if options.reward_scale == "episode" else None
         self.weights[:scaled] *= options.reward_factor(scenario)
-        self._term_names = [term.name for term in self.terms]
-        self.rewarded = np.zeros((n, len(self.terms)))
-        of_steps = tuple(term for term in own_terms if term.name != "regret")
-        self._own_terms = OwnTerms(of_steps, len(self.terms) - len(own_terms), n)
-        self._regret = Regret(self.senders, len(self.terms) - 1) if len(of_steps) < len(own_terms) else None
+        self._term_names = names = [term.name for term in self.terms]
+        self.rewarded = np.zeros((n, len(names)))
+        of_steps = tuple(term for term in own_terms if term.name not in APART)
+        self._own_terms = OwnTerms(of_steps, len(names) - len(own_terms), n)
+        self._regret = Regret(self.senders, names.index("regret")) if "regret" in names else None
+        self._charges = Charges(self.senders, names, options.reference)
 
         self.form = self._observed()
         self.observation_space, self._handed = self.form.space, Handed(self.form)
         self._own_fields = OwnFields(self.form)
-        self._sums_here = bool(own_terms)
-        self._has_own = bool(own_terms or self.form.own_places)
+        self._sums_here = bool(of_steps) or self._regret is not None
+        self._has_own = self._sums_here or bool(self.form.own_places)
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
@@ -175,14 +177,14 @@ class SubEnvs:
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
         loaded = self._load(rows, episodes)
+        if self._regret is not None:
+            self._regret.begin(rows)
         if (same := self._begun.get(len(loaded))) is None:  # a call is repeated with the same arrays
             same = self._begun[len(loaded)] = np.empty_like(loaded)
         same[:] = loaded
         self._run(self._begin, same, NO_ACTIONS)
         if self._has_own:
             self._own_terms.begin(self.senders.batch, rows)
-            if self._regret is not None:
-                self._regret.begin(rows, self.output)
             self._own_fields.write(self.senders.batch, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
@@ -218,12 +220,16 @@ class SubEnvs:
                     given = numbered(self.scenario, **given)
                 begun.append((i, given, None))
         self.senders.load_all(begun)
+        self._charges.begin(rows)
         if self.senders.topics:
             self.senders.batch.senders["ask_at_send"][rows] = 1
         return rows
 
     def _run(self, call: Callable[..., None], rows: NDArray[np.int64], actions: NDArray[np.int64]) -> None:
-        call(step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named)
+        call(
+            step_rows, self.senders.batch, rows, actions, self.rewarded, self.output, self.choices, self.form.named,
+            self.options.repeat, self._charges.cost, self._charges.rival,
+        )  # fmt: skip
 
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""

@@ -9,7 +9,7 @@ from bufgym.oracle.ahead import NO_ROOM, Ahead, find_steps, new_rivals
 from bufgym.oracle.from_queue import find_most, find_values, new_work
 from bufgym.oracle.programme import find_idle
 from bufgym.sim import Senders
-from bufgym.sim.state import ARRIVAL_WAITS
+from bufgym.sim.state import ARRIVAL_WAITS, NOTHING_WAITS
 from bufgym.utils.errors import BufgymError
 
 _ROOM = 1 << 16
@@ -65,6 +65,14 @@ class Hindsight:
         self._load_begun()
         find_most(self.senders.batch, self._ahead, self._work, rows, self._most)
         return self._most
+
+    def at_start(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """float64[n]: likewise of whole episodes, in ``rows`` that have loaded them and not begun to play."""
+        waiting = self.senders.batch.senders["waiting"]
+        waiting[rows] = ARRIVAL_WAITS  # the first arrival finds an empty queue: any decision may be made about it
+        most = self.most(rows)
+        waiting[rows] = NOTHING_WAITS
+        return most
 
     def _load_begun(self) -> None:
         """Compute the steps of episodes that have begun and ask for their first decision."""

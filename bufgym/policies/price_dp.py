@@ -67,6 +67,8 @@ that it would leave; the numbers of the price; those of the share; what dropping
 times 1 - k / s; and, without a target, the gap that may be left with room, in thinning's, and the discount."""
 THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
 PRICE_DISCOUNT, SPARE, SPARE_DISCOUNT = range(23, 26)
+UNUSED = ("price_discount", "spare", "spare_discount")
+"""Parameters that change nothing as they stand. Files of ``ruled_network.RuledWeights`` still name them."""
 LEAST_SHARE = 0.06
 """Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
 UNPRICED = 1e-6

@@ -250,6 +250,7 @@ class RememberingWeights(RuledWeights):
 
     @staticmethod
     def definition(fields: Sequence[str]) -> list[Any]:
-        """That of ``RuledWeights``, and of the past."""
+        """What defines observation and rule; numbers of the rule that change nothing may go without a new training."""
+        rule = {name: number for name, number in price_dp.PARAMETERS.items() if name not in price_dp.UNUSED}
         past = [(field.name, field.unit, field.meaning, NOTHING[field.name]) for field in PAST_INPUTS]
-        return [*RuledWeights.definition(fields), past]
+        return [*CandidateWeights.definition(fields), MEANINGS, rule, past]

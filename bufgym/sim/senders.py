@@ -170,9 +170,9 @@ class Senders:
         self.follow(policy)
         roll_out(self.batch._replace(parameters=policy.parameter_array), shares, memory, policy)
 
-    def follow(self, policy: Policy) -> None:
-        """Configure when ``policy`` is asked, and how the client around it sends."""
-        senders, client = self.batch.senders, policy.client
+    def follow(self, policy: Policy, senders: NDArray[Any] | None = None) -> None:
+        """Configure when ``policy`` is asked, and how the client around it sends; in SENDER[n], by default these."""
+        client, senders = policy.client, self.batch.senders if senders is None else senders
         senders["ask_at_dequeue"], senders["ask_at_send"] = policy.drops_at_dequeue, policy.schedules
         senders["measures"], senders["shows_left"] = policy.measures, policy.measures or policy.reads_left
         senders["remembers"] = policy.remembers

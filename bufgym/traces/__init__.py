@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from bufgym.traces.formats.bags import read_bag
     from bufgym.traces.formats.links import FORMATS, detect_format, read_trace
     from bufgym.traces.formats.motions import read_motion, write_motion_csv
-    from bufgym.traces.formats.pose_tables import PoseColumns
     from bufgym.traces.formats.recordings import read_workload, workload_from_bag
     from bufgym.traces.formats.tables import Columns
     from bufgym.traces.formats.trajectories import read_poses
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from bufgym.traces.generate.rules import ramp, steady, tunnel
 
 __all__ = [
-    "FORMATS", "WRITERS", "Columns", "Motion", "MotionSettings", "PoseColumns", "Poses", "Trace", "Workload",
+    "FORMATS", "WRITERS", "Columns", "Motion", "MotionSettings", "Poses", "Trace", "Workload",
     "describe", "detect_format", "difference", "drive_motion", "fitted_links", "load", "load_motion",
     "markov_link", "motion_from_poses", "ramp", "read_bag", "read_links", "read_motion", "read_poses", "read_trace",
     "read_workload", "read_workload_csv", "shipped", "steady", "synthetic_lte", "tunnel", "workload_from_bag",
@@ -45,7 +44,7 @@ __all__ = [
 ]  # fmt: skip
 
 __getattr__ = on_demand(__name__, {
-    "Columns": "formats.tables", "PoseColumns": "formats.pose_tables",
+    "Columns": "formats.tables",
     "read_bag": "formats.bags", "FORMATS": "formats.links", "detect_format": "formats.links",
     "read_trace": "formats.links", "read_motion": "formats.motions", "write_motion_csv": "formats.motions",
     "read_workload": "formats.recordings", "workload_from_bag": "formats.recordings",

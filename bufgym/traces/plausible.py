@@ -33,6 +33,7 @@ HOLE_S: Final = 2
 SLOW_STEPS: Final = 3
 SLOW_S: Final = 60
 HOUR_S: Final = 3600
+FEW: Final = 0.1  # Of all messages
 
 LEAST_SAMPLE_S: Final = 1e-3  # No tool measures a link more often
 MS_STEP_S: Final = 10  # Steps of ms look like these seconds; of seconds, these are usual:
@@ -153,14 +154,19 @@ def over_holes(path: StrPath, trace: Trace, ends: Sequence[tuple[int, str]], tim
     return empty if policy == "zero" else held
 
 
-def warn_of_pauses(path: StrPath, time_us: Int64Array) -> None:
-    """Warn of stretches without a message."""
+def warn_of_pauses(path: StrPath, time_us: Int64Array, topic: Int64Array, names: Sequence[str]) -> None:
+    """Warn of stretches without a message, int64[n]; a few alone before or after the longest are named by topic."""
     found = holes(np.unique(time_us))
-    if found:
-        longest = max(found, key=lambda hole: hole.end_us - hole.start_us)
-        count = f", the longest of {len(found)} holes" if len(found) > 1 else ""
-        length_s, at_s = (longest.end_us - longest.start_us) / US_PER_S, longest.start_us / US_PER_S
-        warn(path, f"no message for {length_s:,.6g} s{count}, from {at_s:,.6g} s on: nothing is sent in it")
+    if not found:
+        return
+    start_us, end_us = max(((hole.start_us, hole.end_us) for hole in found), key=lambda hole: hole[1] - hole[0])
+    count = f", the longest of {len(found)} holes" if len(found) > 1 else ""
+    doubt = f"no message for {(end_us - start_us) / US_PER_S:,.6g} s{count}, from {start_us / US_PER_S:,.6g} s on"
+    for side, beside in (("before", time_us < end_us), ("after", time_us >= end_us)):
+        if np.count_nonzero(beside) <= max(1, FEW * len(time_us)):
+            on = ", ".join(sorted({names[k] for k in topic[beside]}))
+            doubt += f", {side} which are {np.count_nonzero(beside)} of {len(time_us):,} messages ({on}) alone"
+    warn(path, f"{doubt}: nothing is sent in it")
 
 
 def check_slow_poses(path: StrPath, poses: "Poses") -> None:

@@ -4,13 +4,14 @@ import warnings
 from pathlib import Path
 
 import pytest
+from cli_cases import shown
 from link_files import SAMPLES, knots, written
 from recording_cases import ODD_FILES
 from refusal_cases import refuse
 
-from bufgym.traces import Columns, PoseColumns, read_motion, read_trace, read_workload
+from bufgym.traces import Columns, read_motion, read_trace, read_workload
 from bufgym.traces.formats.trajectories import read_poses
-from bufgym.utils.errors import TraceError, TraceWarning
+from bufgym.utils.errors import BufgymError, TraceError, TraceWarning
 
 S = 1_000_000
 
@@ -93,8 +94,8 @@ TABLES = {
     "stamp [ms];id;px;py;pz\n0;a;0,0;0;0\n1000;b;3,0;0;0\n2000;c;9,0;0;0\n": None,
     "Date,X,Y,Z,QX,QY,QZ,QW\n"
     + "".join(f"2024-01-31T12:00:0{k},{x},0,0,0,0,0,1\n" for k, x in ((0, 0), (1, 3), (2, 9))): None,
-    "a b c\n0 0 5\n0 1000 8\n0 2000 14\n": PoseColumns("b", ("c", "a"), "ms"),
-    "0 0 5\n0 1 8\n0 2 14\n": PoseColumns("2", ("3", "1", "1")),
+    "a b c\n0 0 5\n0 1000 8\n0 2000 14\n": Columns("b", pose=("c", "a"), time_unit="ms"),
+    "0 0 5\n0 1 8\n0 2 14\n": Columns("2", pose=("3", "1", "1")),
     "# id time x y z qx qy qz qw\n7 0 0 0 0 0 0 0 1\n7 1 3 0 0 0 0 0 1\n7 2 9 0 0 0 0 0 1\n": None,
 }
 
@@ -109,10 +110,10 @@ def test_poses_of_any_table(tmp_path: Path, text: str) -> None:
 def test_what_a_table_of_poses_lacks_is_said(tmp_path: Path) -> None:
     path = written(tmp_path, "t,x,y\n0,1,2\n1,1,2,3\n", "poses.csv")
     refuse("line 3: .*must have 3 columns, has 4", read_motion, path)
-    refuse("has no column 'w': must be one of t, x, y", read_motion, path, columns=PoseColumns("t", ("x", "w")))
-    refuse("must be x y, x y z, or", read_motion, path, columns=PoseColumns("t", ("x",)))
-    refuse("time_unit = 'h'", read_motion, path, columns=PoseColumns("t", ("x", "y"), "h"))
-    refuse("go without format and times", read_motion, path, columns=PoseColumns("t", ("x", "y")), format="tum")
+    refuse("has no column 'w': must be one of t, x, y", read_motion, path, columns=Columns("t", pose=("x", "w")))
+    refuse("must be x y, x y z, or", read_motion, path, columns=Columns("t", pose=("x",)))
+    refuse("time_unit = 'h'", read_motion, path, columns=Columns("t", pose=("x", "y"), time_unit="h"))
+    refuse("go without format and times", read_motion, path, columns=Columns("t", pose=("x", "y")), format="tum")
     nine = written(tmp_path, "0 0 0 0 0 0 0 1 5\n1 0 0 0 0 0 0 1 5\n", "nine.txt")
     refuse("must have 8 columns.*has 9: name them with --time COL --pose", read_motion, nine)
     norm = written(tmp_path, "t,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,2\n1,0,0,0,0,0,0,1\n", "norm.csv")
@@ -152,3 +153,21 @@ def test_receivers_of_satellites(tmp_path: Path) -> None:
             poses = read_poses(written(tmp_path, text, "gps.txt"))
         assert poses.time_us.tolist() == [0, 2_000_000] and "no orientation" in poses.format
         assert poses.position_m[1] == pytest.approx([0, 111.13, 0], abs=0.02)
+
+
+def test_messages_of_any_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """100 bytes on /x, 50 ms later 200 on /y, another 50 ms later 100 on /x."""
+    path = written(tmp_path, "a;when [ms];n;ch\n1;0;100;/x\n2;50;200;/y\n3;100;100;/x\n", "any.txt")
+    columns = Columns("when [ms]", bytes="n", topic="ch")
+    workload = read_workload(path, columns=columns)
+    assert workload.arrival_us.tolist() == [0, 50_000, 100_000]
+    assert workload.size_bytes.tolist() == [100, 200, 100]
+    assert [workload.topic_of(k) for k in range(3)] == ["/x", "/y", "/x"]
+    refuse("columns must name bytes", read_workload, path, columns=Columns("a"), kind=BufgymError)
+    refuse("line 1: has no column 'size'", read_workload, path, columns=Columns("a", bytes="size"))
+    recording = ODD_FILES / "good.mcap"
+    refuse("of a table, which a recording is not", read_workload, recording, columns=columns, kind=BufgymError)
+    played = ["bench", "--workload", str(path), "--trace", "4Mbit/s", "--policies", "afr", "--capacity", "3"]
+    assert "3 messages, 400 bytes in 0.100 s" in shown(
+        [*played, "--columns", "2", "n", "ch", "--time-unit", "ms"], capsys
+    )

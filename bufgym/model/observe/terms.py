@@ -76,6 +76,18 @@ def regret(step: Any, memory: Any) -> float:
     raise AssertionError("envs.regret computes it for all rows at once")
 
 
+@reward_term("cost", unit="QoI", one_queue=True, built_in=True)
+def cost(step: Any, memory: Any) -> float:
+    "minus what merged and growing gaps lose, as it happens; sums to H - 1 less a constant of the episode"
+    raise AssertionError("envs.cost computes it for all rows at once")
+
+
+@reward_term("paired", unit="QoI", one_queue=True, built_in=True)
+def paired(step: Any, memory: Any) -> float:
+    "cost less that of the rule `reference` on the same episode; sums to H less that rule's H"
+    raise AssertionError("envs.cost computes it for all rows at once")
+
+
 TOPIC_REWARD_TERMS: tuple[RewardTerm, ...] = (OWN_TERMS["age"], OWN_TERMS["late"])
 """Terms that environments with several topics compute besides; weights are fractions of their sum over the topics."""
 

@@ -15,7 +15,7 @@ from bufgym.traces.formats.definitions import BagTopic as BagTopic
 from bufgym.traces.formats.definitions import typestore as typestore
 from bufgym.traces.formats.faults import LeftOut, StrPath, fault
 from bufgym.traces.formats.geodesy import local_plane
-from bufgym.traces.formats.trajectories import MAX_POSITION_M, NORM_TOLERANCE
+from bufgym.traces.formats.trajectories import MAX_POSITION_M, MOST_OF_FIX, NORM_TOLERANCE
 from bufgym.traces.poses import Poses, product, rotations, unit
 from bufgym.traces.trace import Float64Array, Int64Array
 from bufgym.utils.errors import BufgymError
@@ -37,7 +37,7 @@ _PUBLISHER: Final = re.compile(r"([^:@]+)@([0-9]{1,4})(|:.*)")
 _LISTED_FRAMES: Final = 8
 _CHAIN: Final = 2  # Frames of a transform, or of a chain of them: the first and the last
 _VALUES: Final = 7  # Position and quaternion
-_MOST_OF_FIX: Final = (90.0, 180.0, 1e5)  # degrees, degrees, m
+_MOST: Final = {False: (MAX_POSITION_M,) * 3, True: tuple(MOST_OF_FIX.values())}  # of a place, of a fix
 
 Frames = tuple[str, str]
 """The frame in which a pose is, and the frame whose pose it is (empty where the message does not say)."""
@@ -115,8 +115,8 @@ class PoseCollector:
         """Keep the poses of a message in this file that was logged at `time_ns`."""
         if channel.topic != self.topic:
             if channel.type in TF_TYPES:
-                for _, frames, position, orientation in placed(self._decoded(channel, data)):
-                    self._static[frames] = self._checked_values(TF_STATIC, position, orientation)
+                for frames, values in _values(self._decoded(channel, data)):
+                    self._static[frames] = self._sound(TF_STATIC, values)
             return
         self._count += 1
         if file != self._file:
@@ -126,12 +126,11 @@ class PoseCollector:
         if self._publisher not in (None, number):
             return
         message = self._decoded(channel, data)
-        if channel.type == NAV_SAT_FIX:
-            self._is_fix = True
-            self._keep_fix((_frames(message), number), time_ns, message)
-            return
-        for _, frames, position, orientation in placed(message):
-            self._keep((frames, number), time_ns, position, orientation)
+        self._is_fix = channel.type == NAV_SAT_FIX
+        for frames, values in _fixes(message) if self._is_fix else _values(message):
+            times_ns, kept = self._poses.setdefault((frames, number), (array("q"), array("d")))
+            kept.extend(self._sound(f"{self.topic}, {'fix' if self._is_fix else 'pose'} {len(times_ns) + 1}", values))
+            times_ns.append(time_ns)
 
     def poses(self, topics: dict[str, str]) -> tuple[int, Poses]:
         """Time of the first (ns), and the poses with times from there; of poses at the same time the last counts."""
@@ -234,33 +233,30 @@ class PoseCollector:
             rule = f"cut off or damaged, or of another definition than {channel.type} has in ROS"
             raise fault(self.path, f"message {self._count} on {self.topic} is {rule}: {words}") from error
 
-    def _keep(self, source: tuple[Frames, int], time_ns: int, position: Any, quaternion: Any) -> None:
-        times_ns, kept = self._poses.setdefault(source, (array("q"), array("d")))
-        kept.extend(self._checked_values(f"{self.topic}, pose {len(times_ns) + 1}", position, quaternion))
-        times_ns.append(time_ns)
-
-    def _keep_fix(self, source: tuple[Frames, int], time_ns: int, fix: Any) -> None:
-        """Keep a fix, for now as latitude, longitude and altitude; the receiver says where it has none."""
-        if fix.status.status < 0 or math.isnan(fix.latitude + fix.longitude):
-            return
-        times_ns, kept = self._poses.setdefault(source, (array("q"), array("d")))
-        values = (fix.latitude, fix.longitude, 0.0 if math.isnan(fix.altitude) else fix.altitude)
-        if not all(abs(value) <= most for value, most in zip(values, _MOST_OF_FIX, strict=True)):
-            rule = "must be latitude, longitude and altitude: within 90 and 180 degrees, and 100 km"
-            raise fault(self.path, rule, value=values, field=f"{self.topic}, fix {len(times_ns) + 1}")
-        kept.extend((*values, 0.0, 0.0, 0.0, 1.0))
-        times_ns.append(time_ns)
-
-    def _checked_values(self, field: str, position: Any, quaternion: Any) -> list[float]:
-        values = [position.x, position.y, position.z, quaternion.x, quaternion.y, quaternion.z, quaternion.w]
+    def _sound(self, field: str, values: list[float]) -> list[float]:
         # Written so that NaN fails.
-        if not all(abs(value) <= MAX_POSITION_M for value in values[:3]):
+        if not all(abs(value) <= most for value, most in zip(values, _MOST[self._is_fix], strict=False)):
             rule = f"must be finite and within {MAX_POSITION_M:g} m"
-            raise fault(self.path, rule, value=tuple(values[:3]), field=f"{field}, position")
+            if self._is_fix:
+                rule = "must be latitude, longitude and altitude: within 90 and 180 degrees, and 100 km"
+            raise fault(self.path, rule, value=tuple(values[:3]), field=field + ", position" * (not self._is_fix))
         norm = math.hypot(*values[3:])
         if not abs(norm - 1) <= NORM_TOLERANCE:
             raise fault(self.path, "must be 1 within 1 %", value=f"{norm:.6g}", field=f"{field}, norm")
         return values
+
+
+def _values(message: Any) -> Iterator[tuple[Frames, list[float]]]:
+    """Frames, position and orientation of each pose in a message."""
+    for _, frames, place, turn in placed(message):
+        yield frames, [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+
+
+def _fixes(fix: Any) -> Iterator[tuple[Frames, list[float]]]:
+    """The same with latitude, longitude and altitude for now; none where the receiver says that it has none."""
+    if fix.status.status >= 0 and not math.isnan(fix.latitude + fix.longitude):
+        altitude = 0.0 if math.isnan(fix.altitude) else fix.altitude
+        yield _frames(fix), [fix.latitude, fix.longitude, altitude, 0.0, 0.0, 0.0, 1.0]
 
 
 def _at(own_ns: Int64Array, values: Float64Array, times_ns: Int64Array) -> Float64Array:

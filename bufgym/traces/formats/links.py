@@ -58,8 +58,12 @@ def _by_recipe(recipe: Recipe) -> Format:
 
 FORMATS: Final[dict[str, Format]] = {
     "mahimahi": Format("one number, the ms of a packet", _cells(NUMBER), read_mahimahi),
-    "mbit": Format("two numbers, s and Mbit/s", _cells(NUMBER, NUMBER), tables.read_mbit),
-    "rates": Format(f"header {tables.RATES_HEADER} or time,mbps", tables.fits_rates, tables.read_rates),
+    "mbit": Format(
+        "two numbers, s and Mbit/s",
+        _cells(NUMBER, NUMBER),
+        lambda path: tables.read_table(path, tables.Columns("1", "2", "Mbit/s")),
+    ),
+    "rates": Format(f"header {tables.RATES_HEADER} or time,mbps", tables.fits_rates, tables.read_table),
     "ucc": Format("header with Timestamp, DL_bitrate, UL_bitrate", fits_ucc, read_ucc, UCC_COLUMNS),
     "sabre": Format("JSON list", _cells(r"\["), read_sabre),
     "iperf3": Format("JSON objects", _cells(r"\{"), read_iperf3, DIRECTIONS),

@@ -50,7 +50,7 @@ def read_ucc(path: StrPath, column: str = "DL_bitrate") -> Knots:
     intervals = Intervals()
     with open_text(path) as file:
         header, lines = file.below_header(f"a header that names {_UCC_TIME}, {', '.join(UCC_COLUMNS)}", fits_ucc)
-        names = split_cells(header)
+        names = split_cells(header.text)
         time_at, rate_at = names.index(_UCC_TIME), names.index(column)
         first = previous = latest = None
         for line in lines:

@@ -6,9 +6,9 @@ from typing import Final
 
 from bufgym.traces.formats.faults import StrPath, heard, warn
 from bufgym.traces.formats.links import trace_name
-from bufgym.traces.formats.pose_tables import PoseColumns
 from bufgym.traces.formats.rows import read_rows
 from bufgym.traces.formats.splits import refuse_recording
+from bufgym.traces.formats.tables import Columns
 from bufgym.traces.formats.text import Line, decimals, is_header, open_text, write_text
 from bufgym.traces.formats.trajectories import read_poses, seconds
 from bufgym.traces.motion import Motion, MotionSettings, motion_from_poses
@@ -25,7 +25,7 @@ def read_motion(
     *,
     format: str | None = None,
     times: StrPath | None = None,
-    columns: PoseColumns | None = None,
+    columns: Columns | None = None,
     advance: Callable[[int], object] = int,
 ) -> Motion:
     """Read a trajectory (TUM, EuRoC, KITTI) or a `t_s,motion` CSV, plain or gzip'd, recognised by the first line.

@@ -5,17 +5,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bufgym.traces import plausible
 from bufgym.traces.formats import bags
-from bufgym.traces.formats.clocks import NS_PER_S
 from bufgym.traces.formats.faults import StrPath, heard, warn
 from bufgym.traces.formats.links import trace_name
 from bufgym.traces.formats.splits import is_recording
+from bufgym.traces.formats.tables import Columns
 from bufgym.traces.formats.workloads import read_workload_csv
 from bufgym.traces.motion import MotionSettings, motion_from_poses
 from bufgym.traces.poses import gaps_between, longest_s
@@ -23,9 +22,6 @@ from bufgym.traces.sheet import Facts, Sheet, time_facts
 from bufgym.traces.trace import US_PER_S, Float64Array, Int64Array
 from bufgym.traces.workload import Workload
 from bufgym.utils.errors import BufgymError
-
-_FAR_S: Final = 60  # From a few first or last messages to all others
-_FEW: Final = 0.1  # Of all messages
 
 
 def read_workload(
@@ -36,6 +32,7 @@ def read_workload(
     settings: MotionSettings | None = None,
     bridge_gaps: bool = False,
     clock: str = "log",
+    columns: Columns | None = None,
     advance: Callable[[int], object] = int,
 ) -> Workload:
     """Read a recording of a robot (see `bags.read_bag`) or a workload CSV, recognised by the first bytes.
@@ -48,6 +45,7 @@ def read_workload(
         bridge_gaps: take motion across a gap as the straight way from its first pose to its last (before the first
             pose and after the last: none); otherwise a gap is an error.
         clock: the clock of a recording's arrivals (see `bags.read_bag`).
+        columns: of any other table, which columns hold times, bytes and topics.
         advance: called with 1 for each message of a recording read, as a progress bar's update.
     """
     if not isinstance(path, str | PathLike) and len(path) == 1:
@@ -55,7 +53,9 @@ def read_workload(
     if isinstance(path, str | PathLike) and not is_recording(path):
         if odom is not None and Path(path).exists():
             raise BufgymError(f"{path}: odom = {odom!r}: needs a recording, which this is not")
-        return _with_topics(read_workload_csv(path), topics)
+        return _with_topics(read_workload_csv(path, columns), topics)
+    if columns is not None:
+        raise BufgymError(f"{path}: columns are of a table, which a recording is not")
     bag = bags.read_bag(path, odom, advance, clock)
     return workload_from_bag(bag, topics=topics, settings=settings, bridge_gaps=bridge_gaps)
 
@@ -73,15 +73,13 @@ def workload_from_bag(
     if not chosen.any():
         raise BufgymError(f"{bag.path}: no message on {', '.join(names) or 'any topic'}")
     time_ns = bag.time_ns[chosen]
-    distant = _distant(time_ns, [names[number] for number in topic])
     with heard() as doubts:
-        if distant and (bag.poses is None or bridge_gaps):
-            warn(bag.path, distant)
-        elif not distant:
-            # Of all topics, as one alone may send now and then.
-            meanwhile = bag.time_ns[(bag.time_ns >= time_ns[0]) & (bag.time_ns <= time_ns[-1])]
-            plausible.warn_of_pauses(bag.path, (meanwhile - time_ns[0]) // 1000)
-        x, gaps, facts = _motion_at(time_ns, bag, settings, bridge_gaps, distant)
+        # Of all topics, as one alone may send now and then.
+        inside = (bag.time_ns >= time_ns[0]) & (bag.time_ns <= time_ns[-1])
+        plausible.warn_of_pauses(
+            bag.path, (bag.time_ns[inside] - time_ns[0]) // 1000, bag.topic[inside], list(bag.topics)
+        )
+        x, gaps, facts = _motion_at(time_ns, bag, settings, bridge_gaps)
     facts = (*time_facts("messages", (time_ns - time_ns[0]) // 1000, int(time_ns[0]) // 1000), *bag.sheet.facts, *facts)
     measured = ""
     if bag.poses is not None:
@@ -97,7 +95,7 @@ def workload_from_bag(
 
 
 def _motion_at(
-    time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool, distant: str
+    time_ns: Int64Array, bag: bags.Bag, settings: MotionSettings, bridge_gaps: bool
 ) -> tuple[Float64Array | None, tuple[tuple[int, int], ...], Facts]:
     """x of messages at these times, from 0, the gaps in the poses between them, and facts; None without poses."""
     if bag.poses is None:
@@ -108,39 +106,16 @@ def _motion_at(
     time_us = (time_ns - bag.poses_from_ns) // 1000
     gaps = _gaps(time_us, bag.poses.time_us, settings.max_gap_s)
     if gaps and not bridge_gaps:
-        if distant and len(gaps) == 1:
-            raise BufgymError(f"{bag.path}: {distant}: choose other topics, or say --bridge-gaps (bridge_gaps=True)")
         start, _ = max(gaps, key=lambda gap: gap[1] - gap[0])
         count = f"{len(gaps)} gaps" if len(gaps) > 1 else "a gap"
         raise BufgymError(
             f"{bag.path}: {bag.poses.format} has {count} of more than {settings.max_gap_s:g} s without a pose, the "
             f"longest {longest_s(gaps):.1f} s, at {start / US_PER_S:.1f} s: say --bridge-gaps (bridge_gaps=True) to "
-            "take motion across as even, or choose other odometry"
+            "take motion across as even, or choose other odometry or topics"
         )
     # Before the first pose and after the last no motion is known: np.interp holds its ends.
     x = np.interp(time_us, motion.time_us, motion.coordinate)
     return x - x[0], gaps, tuple(fact for fact in motion.sheet.facts if fact[0] not in ("start", "step"))
-
-
-def _distant(time_ns: Int64Array, topics: Sequence[str]) -> str:
-    """Says of a few first or last messages that they are far from all others, as a map is that was latched; or "".
-
-    Far is more than a minute, and longer than the others take.
-    """
-    if len(time_ns) < 2:
-        return ""
-    steps_ns = np.diff(time_ns)
-    k = int(np.argmax(steps_ns))
-    hole_s, first = steps_ns[k] / NS_PER_S, k + 1 <= len(steps_ns) - k
-    count = min(k + 1, len(steps_ns) - k)
-    others = time_ns[k + 1 :] if first else time_ns[: k + 1]
-    others_s = (others[-1] - others[0]) / NS_PER_S
-    if hole_s <= _FAR_S or hole_s <= others_s or count > max(1, _FEW * len(time_ns)):
-        return ""
-    place, side = ("first", "before") if first else ("last", "after")
-    on = ", ".join(sorted(set(topics[: k + 1] if first else topics[k + 1 :])))
-    which = f"the {place} {count} messages ({on}) are" if count > 1 else f"the {place} message ({on}) is"
-    return f"{which} logged {hole_s:.1f} s {side} the other {len(others):,}, which take {others_s:.3f} s"
 
 
 def _gaps(arrival_us: Int64Array, pose_us: Int64Array, max_gap_s: float) -> tuple[tuple[int, int], ...]:

@@ -6,7 +6,6 @@ lines, 4096 characters a line, and for what is held as a whole 16 MiB of JSON an
 """
 
 import io
-import itertools
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -33,7 +32,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WHOLE = re.compile(r"[0-9]+")
 NUMBER: Final = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"  # Pattern of a plain finite decimal number
 _NUMBER = re.compile(NUMBER)
-_NO_JSON: Final = re.compile(rb"\s*\[ *(?:ID|SUM|[0-9]+)\] +\S")
+_NO_JSON: Final = re.compile(rb"\[ *(?:ID|SUM|[0-9]+)\] +\S")
 _MILLISECONDS = re.compile(r"([0-9]+)(?:\.([0-9]{1,3})0*)?")
 
 
@@ -157,17 +156,13 @@ class TextFile:
 
     def lines(self) -> Iterator[Line]:
         """The lines that are not blank, numbered from 1, without surrounding white space."""
-        for number, raw in self._raw_lines():
-            line = _parsed_line(self.path, number, raw)
-            if len(raw) > MAX_LINE_CHARACTERS and not raw.endswith(b"\n"):
-                raise _too_long(line)
-            if line.text:
-                yield line
+        for number, block in self.blocks():
+            yield from self.block_lines(number, block)
 
     def blocks(self) -> Iterator[tuple[int, bytes]]:
         """All lines in blocks of some MB, each with the number of its first line; see `block_lines`."""
         number, rest = 1, b""
-        while data := self._take(_BLOCK_BYTES, number, whole_line=False):
+        while data := self._take(_BLOCK_BYTES, number):
             cut = data.rfind(b"\n") + 1
             if cut:
                 yield number, rest + data[:cut]
@@ -189,9 +184,9 @@ class TextFile:
 
     def _count(self, number: int) -> None:
         if number > MAX_LINES:
-            raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=number)
+            raise fault(self.path, f"more than {MAX_LINES} lines: must be fewer", line=MAX_LINES + 1)
 
-    def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[str, Iterator[Line]]:
+    def below_header(self, header: str, fits: Callable[[str], object]) -> tuple[Line, Iterator[Line]]:
         """The first line, which must be that ``header`` (in words), and the lines below it."""
         lines = self.lines()
         first = next(lines, None)
@@ -199,25 +194,23 @@ class TextFile:
             raise fault(self.path, f"is empty: must begin with {header}")
         if not fits(first.text):
             raise first.misfit(f"must be {header}")
-        return first.text, lines
+        return first, lines
 
     def first(self) -> Line | None:
         """The first line that is not blank, None in an empty file.
 
         JSON may be a single line of any length, so only its opening bracket is returned; iperf's text begins with one.
         """
-        for number, raw in self._raw_lines():
-            bracket = raw.lstrip()[:1]
-            if bracket in (b"[", b"{") and not _NO_JSON.match(raw):
-                return Line(self.path, number, bracket.decode())
-            line = _parsed_line(self.path, number, raw)
-            if line.text:
-                return line
-        return None
+        with self._damage(1):
+            head = self._stream.peek(HEAD_BYTES).removeprefix(_BYTE_ORDER_MARK)
+        start = head.lstrip()
+        if start[:1] in (b"[", b"{") and not _NO_JSON.match(start):
+            return Line(self.path, 1 + head[: len(head) - len(start)].count(b"\n"), start[:1].decode())
+        return next(self.lines(), None)
 
     def whole(self, most: int) -> bytes:
         """All of it, at most `most` bytes."""
-        content = self._take(most + 1, 1, whole_line=False)
+        content = self._take(most + 1, 1)
         if len(content) > most:
             raise fault(self.path, f"more than {most} bytes: must be at most")
         return content
@@ -232,19 +225,9 @@ class TextFile:
             value = content[error.start : error.start + 20]
             raise fault(self.path, "must be UTF-8 text", line=line, value=value) from error
 
-    def _raw_lines(self) -> Iterator[tuple[int, bytes]]:
-        """Each line's number and bytes; of a line that is too long, the first bytes, as many as show that it is."""
-        for number in itertools.count(1):
-            # Two more than the limit, so that a line of just that length still comes with its end ("\r\n").
-            raw = self._take(MAX_LINE_CHARACTERS + 2, number, whole_line=True)
-            if not raw:
-                return
-            self._count(number)
-            yield number, raw
-
-    def _take(self, count: int, line: int, whole_line: bool) -> bytes:
+    def _take(self, count: int, line: int) -> bytes:
         with self._damage(line):
-            data = self._stream.readline(count) if whole_line else self._stream.read(count)
+            data = self._stream.read(count)
         is_start = self._read_bytes == 0
         self._read_bytes += len(data)
         if self._read_bytes > self._most_bytes:

@@ -175,7 +175,7 @@ def read_sizes(path: Path) -> dict[str, Int64Array]:
     """Column -> int64[m] of a table of whole numbers with a header; `motion` is x in millionths of a view."""
     with open_text(path) as file:
         header, lines = file.below_header("a header that names its columns", bool)
-        titles = split_cells(header)
+        titles = split_cells(header.text)
         rows = [
             [line.whole(title, cell, MAX_MESSAGE_BYTES) for title, cell in zip(titles, cells, strict=True)]
             for line in lines

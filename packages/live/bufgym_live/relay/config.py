@@ -44,20 +44,23 @@ class Rule(Section, frozen=True, kw_only=True):
     address: str = ""
     """An IP address, or a range as ``10.0.0.0/8``."""
     email: str = ""
-    """E-mail of a token or of a client's certificate."""
+    """E-mail of a token or of a client's certificate, in any case of ASCII letters."""
     recorder: bool = False
-    """Whether the rule is for the relay's own recorder."""
+    """For the relay's recorder, which writes what it may receive."""
     foxglove: bool = False
-    """Whether the rule is for everybody who connects to the relay's Foxglove server."""
+    """For everybody who connects to the port of ``[foxglove]``."""
     nats: bool = False
-    """Whether the rule is for the other relays: what they may send to this one, and receive from it."""
+    """For other relays: what they may send here, and receive from here."""
     send: bool = False
+    """May publish on the topics."""
     receive: bool = False
+    """May get messages of the topics."""
     topic: str = ".*"
+    """Pattern of topics."""
     command_s: Seconds = COMMAND_S
-    """Time after which a robot does not execute a command sent under this rule; its sender may say less."""
+    """Time for which a command of this sender may be executed, s."""
     speed: Annotated[float, Meta(gt=0, le=100)] = 3.0
-    """Largest velocity that is sent on to a robot under this rule, m/s and rad/s."""
+    """Largest velocity on ``drive`` and in a ``Twist``, m/s and rad/s."""
 
     def __post_init__(self) -> None:
         if sum(map(bool, (self.address, self.email, self.recorder, self.foxglove, self.nats))) != 1:
@@ -87,31 +90,31 @@ class Limits(Section, frozen=True):
     """
 
     message_bytes: Annotated[int, Meta(ge=1, le=2**25)] = 2**23
-    """Size of a frame."""
+    """Size of one message."""
     topics: Count = 1_024
-    """Topics that it publishes on."""
+    """Topics it publishes on."""
     subscriptions: Count = 512
-    """Subscriptions at a time, and durable ones that the relay keeps. A long pattern counts as several."""
+    """Subscriptions at a time, and durable ones kept. A long pattern counts as several."""
     queues: Count = 1_024
-    """Queues of its subscriptions; beyond, topics of a subscription share. One of capacity 1,000 takes 0.1 MB."""
+    """Queues of its subscriptions. Beyond, topics share. A queue of capacity 1,000 takes 0.1 MB."""
     sessions: Count = 256
-    """Sessions that the relay keeps, with the messages held for them."""
+    """Sessions kept. A new one replaces the one away for longest."""
     connections: Count = 128
+    """Connections at a time; of one address, also those without a hello."""
     messages_per_s: Count = 10_000
-    """Messages; and as many pings, pongs and pieces of messages."""
+    """Messages a second, and as many pings, pongs and fragments."""
     bytes_per_s: Count = 10**8
+    """Bytes of payloads a second."""
     json_bytes_per_s: Count = 2**22
-    """Bytes of JSON that it may have parsed; beyond, its frames wait. A text frame counts for 500 bytes more."""
+    """Bytes of JSON parsed a second. Beyond, its frames wait."""
     incoming_bytes: Count = 2**26
-    """Bytes that have come and are not a whole message yet, or not taken. Beyond, the connection ends that waits
-    longest."""
+    """Bytes not taken yet. Beyond, the connection that waits longest ends."""
     identities: Count = 4
-    """How many times the incoming bytes, queues, sessions and JSON (so replays, too) of one identity all identities of
-    one address may have."""
+    """Factor on incoming bytes, queues, sessions and JSON for all identities of one address together."""
     all_connections: Count = 4_096
     """Connections of all identities together."""
     hello_s: Seconds = 5.0
-    """Time from the connection to its hello."""
+    """Time from the connection to its hello, s."""
 
     def __post_init__(self) -> None:
         if self.incoming_bytes < 2 * self.message_bytes:
@@ -123,43 +126,45 @@ class StoreLimits(Section, frozen=True):
     """Limits of the store, which holds no_drop messages until their receivers have acked them."""
 
     messages: Count = 1_000
-    """Messages held for one session. A further one is refused, unless others can take it: then the oldest here goes."""
+    """Messages held for one receiver. A further one is refused, or replaces the oldest where another has room."""
     bytes: Count = 2**26
-    """Bytes held in total. The identity for which the most is held loses its oldest, or gets no more."""
+    """Bytes held in total. Beyond, who has the most loses its oldest, or the sender is refused."""
     keep_s: Seconds = 86_400.0
-    """Absence after which a session is forgotten, with the messages held for it. Only time in which the relay runs
-    counts, and a restart begins it again; the system's clock may jump."""
+    """Absence after which a session is forgotten, s. A restart begins the count again."""
     window: Annotated[int, Meta(ge=1, le=MAX_WINDOW)] = 5
-    """n_T, no_drop messages on their way to or from a client and not acked, at most."""
+    """n_T: most unacked no_drop messages on their way, each direction."""
 
 
 class Tls(Section, frozen=True):
     """Certificates, PEM files."""
 
     certificate: Text
+    """The relay's certificate, a PEM file, as the others."""
     key: Text
+    """Its private key."""
     clients: str = ""
-    """Authority that signs clients' certificates; if empty, clients are not asked for certificates."""
+    """Authority that signs clients' certificates. Empty: clients are not asked for one."""
 
 
 class Tokens(Section, frozen=True):
     """JSON web tokens, as an OpenID provider issues them."""
 
     issuer: Text
+    """Issuer that a token must name (``iss``)."""
     audience: Text
+    """Audience that a token must name (``aud``)."""
     keys: Text
-    """The issuer's key set (JWKS), a URL or a file. It is read again when a token names an unknown key or the file has
-    changed."""
+    """The issuer's key set (JWKS): an https URL, or a file."""
     algorithms: tuple[str, ...] = ("RS256", "ES256", "EdDSA")
+    """Accepted signatures, with public keys only."""
     leeway_s: Annotated[float, Meta(ge=0, le=1e6)] = 10.0
-    """Allowed difference between clocks."""
+    """Allowed difference between clocks, s."""
     client: str = ""
-    """The page's client id at the issuer, with which it signs people in; empty if it asks for a token. Identity tokens
-    have it as their audience, so it is one that the relay takes."""
+    """The page's client id at the issuer, and an accepted audience. Empty: the page asks for a token."""
     scope: Text = "openid email"
-    """What the page asks the issuer for; many renew a token only with ``offline_access``."""
+    """Scope that the page asks for. Many issuers renew a token only with ``offline_access``."""
     endpoints: tuple[str, ...] = ()
-    """Origins of the issuer's token endpoint, as ``https://tokens.example.org``, if it is not the issuer's own."""
+    """Origins of the issuer's token endpoint, if not the issuer's own."""
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.algorithms) - set(ALGORITHMS))
@@ -195,15 +200,15 @@ class Nats(Section, frozen=True):
     """A NATS server with JetStream, over which relays share messages (extra ``mesh``)."""
 
     url: Annotated[str, Meta(pattern="^(nats|tls)://[^/ ]+$")]
-    """``nats://HOST:PORT`` or ``tls://HOST:PORT``."""
+    """``nats://HOST:PORT`` or ``tls://HOST:PORT``, with JetStream."""
     name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
-    """This relay's name among the others. Its place in their commands is kept under it."""
+    """This relay's name, which no other relay has."""
     credentials: str = ""
-    """The server's file of a user's credentials (``.creds``); empty if it wants none."""
+    """File of a user's credentials (``.creds``)."""
     authority: str = ""
-    """PEM file of the authority that signs the server's certificate; empty for the system's."""
+    """PEM file of who signs the server's certificate. Empty: the system's."""
     late_s: Seconds = 2.0
-    """Time beyond its relay's usual delay after which a message, other than a no_drop one, is dropped as late."""
+    """Delay beyond the usual after which an ordinary message is dropped, s."""
 
     def __post_init__(self) -> None:
         try:
@@ -223,37 +228,42 @@ class Foxglove(Section, frozen=True):
     """Address for Foxglove and Lichtblick (extra ``foxglove``); they see what rules with ``foxglove`` allow."""
 
     host: Text = "127.0.0.1"
+    """Address to listen at. It asks nobody for an identity."""
     port: Port = 8765
+    """Port."""
 
 
 class Rotation(Section, frozen=True):
     """Rotation of a log: a full file is followed by the next, and the oldest is deleted."""
 
     bytes: Annotated[int, Meta(ge=1_000, le=2**40)] = 2**26
+    """Size of a file."""
     files: Annotated[int, Meta(ge=1, le=10**6)] = 16
+    """Files kept."""
 
 
 class Config(Section, frozen=True, kw_only=True):
     """The whole configuration."""
 
     host: Text = "127.0.0.1"
+    """Address to listen at. ``0.0.0.0`` is every network: then use ``[tls]``."""
     port: Port = PORT
-    """Port; 0 for any that is free."""
+    """Port. 0: any free one."""
     rules: tuple[Rule, ...] = ()
     no_drop: tuple[str, ...] = NO_DROP
-    """Patterns of lossless topics; each must match the whole topic."""
+    """Patterns of topics whose messages may not be lost."""
     latched: tuple[str, ...] = LATCHED
-    """Patterns of topics whose last message a new subscriber gets, too; as ROS does for latched topics."""
+    """Patterns of topics whose last message a new subscriber gets. 64 MiB in memory."""
     policies: Annotated[tuple[str, ...], Meta(min_length=1)] = POLICIES
-    """Policies of subscribers' queues; the first is the default."""
+    """Policies for subscribers' queues. The first is the default."""
     origins: tuple[str, ...] = ()
-    """Web pages of other servers that may connect, as ``https://example.org``."""
+    """Web pages that may connect beside the relay's own, as ``https://example.org``. Behind a proxy: its own, too."""
     robofleet: bool = False
-    """Whether Robofleet's released clients may connect, on any path but ours, under the same rules."""
+    """Robofleet's released clients may connect, under the same rules."""
     folder: Path | None = None
-    """Folder for held messages, the audit log and recordings; without it they end with the relay."""
+    """Folder of held messages, stops, audit log and recordings. Without it, they end with the relay."""
     small_buffers: bool = True
-    """Whether little waits unsent in the system's buffers to clients, where no policy can drop it."""
+    """Little waits unsent in the system's buffers, where no policy can drop it."""
     limits: Limits = Limits()
     store: StoreLimits = StoreLimits()
     audit: Rotation = Rotation()

@@ -74,7 +74,7 @@ class Monitor:
             self._counts[put.topic].dropped += 1
 
     def state(self) -> dict[str, Any]:
-        """Return the current state; ``docs/guide/relay-robots.md`` lists the fields."""
+        """Return the current state; ``PROTOCOL.md`` lists the fields."""
         now_s = self._clock()
         while self._left and self._left[0][0] < now_s - RATE_S:
             self._left.popleft()

@@ -10,6 +10,7 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 from bufgym.scenario import Stream
@@ -21,16 +22,24 @@ from bufgym_live.robot.ros1 import needs_rospy
 from bufgym_live.robot.ros2.names import Published
 from bufgym_live.robot.ros2.relay import look, own_node, spinning
 from bufgym_live.robot.ros2.republishing import HOLD_S, readers_found
+from bufgym_live.robot.tasks import until_one_ends
 
 NODE: Final = "bufgym_robot"
 TWIST: Final = Published("/cmd_vel", "geometry_msgs/msg/Twist")
 """Topic on which a person drives the robot, if it is one of those that it receives."""
 Outlet = Callable[[bytes], Callable[[], None]]
-"""Reads a message in CDR, and returns what publishes it here."""
+"""Reads a message in CDR, and returns what publishes it here, or raises a BufgymError if nobody would hear it."""
 
 
 def resolved(name: str) -> str:
     return name if name.startswith("/") else f"/{name}"
+
+
+def _to_readers(name: str, readers: Callable[[], int], publish: Callable[[], None]) -> None:
+    """Publish; ROS drops without a word what nobody subscribes to, and that would be no execution."""
+    if not readers():
+        raise BufgymError(f"nobody here subscribes to {name}")
+    publish()
 
 
 class _RosSource:
@@ -95,6 +104,19 @@ class _RosSource:
                 self._outlets[topic] = await self._advertise(topic)
         return self._outlets[topic]
 
+    async def _expect_stops(self) -> None:
+        """Find the readers of velocities before the first stop, which would wait for them; never return.
+
+        If a stop holds by then, say zeros: it may move at what this program said before it was killed, and a stop
+        that came before ROS was there has reached nobody.
+        """
+        if TWIST.name in self._receive:
+            with suppress(BufgymError):  # the next stop says it
+                await self._outlet(TWIST)
+                if self._is_stopped():
+                    await self.on_command({"command": "stop"})
+        await asyncio.Event().wait()
+
     def status(self) -> dict[str, Any]:
         """Return the topics that others may publish on, below ``to``, and whether one of them drives it."""
         return {"receives": self._receive, "commands": ["drive"] if TWIST.name in self._receive else []}
@@ -129,7 +151,8 @@ class Ros2(_RosSource):
 
                 def read(payload: bytes) -> Callable[[], None]:
                     deserialize_message(payload, topic.message_class)  # nodes would meet what is broken
-                    return functools.partial(publisher.publish, payload)
+                    publish = functools.partial(publisher.publish, payload)
+                    return functools.partial(_to_readers, topic.name, publisher.get_subscription_count, publish)
 
                 return read
 
@@ -141,7 +164,8 @@ class Ros2(_RosSource):
 
             self._listen(robot, advertise)
             async with spinning(here):
-                await look(here, lambda: self._wanted(robot), subscribe, NODE, robot.client.note)
+                looking = look(here, lambda: self._wanted(robot), subscribe, NODE, robot.client.note)
+                await until_one_ends(looking, self._expect_stops())
 
 
 class Ros1(_RosSource):
@@ -156,19 +180,21 @@ class Ros1(_RosSource):
 
         async def advertise(topic: Published) -> Outlet:
             publisher = rospy.Publisher(topic.name, topic.message_class, queue_size=10)
-            await readers_found(topic.name, publisher.get_num_connections, lambda: 0, until_s, robot.client.note)
+            # Only the master knows of readers; one is waited for a moment, also later than at the start.
+            await readers_found(topic.name, publisher.get_num_connections, lambda: 1, until_s, robot.client.note)
 
             def read(payload: bytes) -> Callable[[], None]:
                 sent = rospy.AnyMsg()
                 sent._buff = ros_messages.as_ros1(payload, topic.type)
-                return functools.partial(publisher.publish, sent)
+                publish = functools.partial(publisher.publish, sent)
+                return functools.partial(_to_readers, topic.name, publisher.get_num_connections, publish)
 
             return read
 
         self._listen(robot, advertise)
         subscribers = [rospy.Subscriber(name, rospy.AnyMsg, self._taker(robot, name)) for name in self._wanted(robot)]
         try:
-            await asyncio.Event().wait()
+            await self._expect_stops()
         finally:
             for subscriber in subscribers:
                 subscriber.unregister()

@@ -1,6 +1,6 @@
 """What goes over a relay's WebSockets: binary frames are a message each, text frames are JSON objects with an ``op``.
 
-A binary message, big endian (``docs/guide/relay-wire.md``): a header of 32 bytes, then topic, type, encoding
+A binary message, big endian (``PROTOCOL.md``): a header of 32 bytes, then topic, type, encoding
 and sender in UTF-8, then the payload. In JSON the same message is an object whose ``data`` is the value itself
 where the encoding is ``json``, and base64 of the payload where it is not.
 """

@@ -9,106 +9,23 @@ import contextlib
 import json
 import random
 import time
-from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any
 
 from cut_cases import Cuttable
-from relay_cases import until, wait
+from relay_cases import client, until, wait
+from restart_robots import Played, Running, Within
+from restart_truth import LATE_S, OPEN, Goal, Said, Truth, covers
+from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
-from bufgym_live.relay.ledger import named
 from bufgym_live.relay.orders import heard_stops
-from bufgym_live.relay.robot import Robot
 from bufgym_live.relay.session import Session
 
-DEADLINE_S = 0.5
-LATE_S = 0.8
-"""An age at which no goal begins: its deadline, and what the test itself takes."""
-OPEN = ("nobody knows", "withdrawn", "the client has ended")
-"""Errors of a goal that was executed, or not: its sender said a stop or ended meanwhile, or nobody can tell."""
-
-
-@dataclass
-class Goal:
-    """A goal, when it was sent, and its answer: empty if it was executed."""
-
-    sent_s: float
-    answer: str | None = None
-
-
-@dataclass
-class Said:
-    """A stop: when ``stop`` returned, and when somebody began to release it and had done so."""
-
-    returned_s: float
-    begun_s: float | None = None
-    released_s: float | None = None
-
-
-@dataclass
-class Truth:
-    """What was said, what the robot did, and what must not be."""
-
-    goals: dict[str, Goal] = field(default_factory=dict)
-    stops: dict[str, Said] = field(default_factory=dict)
-    released: list[str] = field(default_factory=list)
-    """Stops of which somebody has begun the release."""
-    begun: Counter[str] = field(default_factory=Counter)
-    done: Counter[str] = field(default_factory=Counter)
-    counts: Counter[str] = field(default_factory=Counter)
-    wrong: list[str] = field(default_factory=list)
-
-    def covered(self, ids: list[str]) -> list[Said]:
-        """The stops that a release of these covers."""
-        return [said for id, said in self.stops.items() if covers(ids, id)]
-
-    def standing(self) -> list[str]:
-        """The stops that returned, and of which nobody has begun the release."""
-        return [id for id, said in self.stops.items() if said.begun_s is None]
-
-
-def covers(ids: list[str], id: str) -> bool:
-    """Whether one of these is the stop, or a later one of the same who."""
-    who, number = named(id)
-    return any(named(one)[0] == who and named(one)[1] >= number for one in ids)
-
-
-class Body:
-    """The robot's program, over all its restarts: a goal takes a moment."""
-
-    streams = ()
-
-    def __init__(self, truth: Truth, chance: random.Random) -> None:
-        self._truth, self._chance = truth, chance
-        self.robot: Robot | None = None
-
-    async def run(self, robot: Robot) -> None:
-        await asyncio.Event().wait()
-
-    def status(self) -> dict[str, Any]:
-        return {"commands": ["stop", "goal"]}
-
-    async def on_command(self, command: Any) -> None:
-        if command["command"] != "goal":
-            return
-        truth, id, now_s = self._truth, command["id"], time.monotonic()
-        goal = truth.goals[id]
-        truth.begun[id] += 1
-        truth.counts["goals executed"] += 1
-        if truth.begun[id] > 1:
-            truth.wrong.append(f"twice: goal {id}")
-        if now_s - goal.sent_s > LATE_S:
-            truth.wrong.append(f"late: goal {id} after {now_s - goal.sent_s:.2f} s")
-        if self.robot is not None and self.robot.latch.is_set:
-            truth.wrong.append(f"goal {id} while a stop holds at the robot")
-        for stop, said in truth.stops.items():
-            if said.returned_s <= goal.sent_s and said.begun_s is None:
-                truth.wrong.append(f"goal {id}, sent after stop {stop} returned, which nobody has released")
-        if self._chance.random() < 0.3:
-            await asyncio.sleep(self._chance.uniform(0, 0.1))
-        truth.done[id] += 1
+STANDS_S = 20.0
+"""Time in which a robot that holds a stop stands, once all have met."""
+Make = Callable[[Truth, random.Random, str], Played]
+"""Makes the robot, which connects to this address."""
 
 
 class Watch:
@@ -119,6 +36,8 @@ class Watch:
         self.relay: list[str] = []
         self.robot: list[str] | None = None
         self.status: Any = None
+        self.status_s = 0.0
+        """When it heard the robot's last status."""
         self.session.subscribe("^/robots/", self._heard)
 
     def _heard(self, message: Any) -> None:
@@ -129,31 +48,23 @@ class Watch:
             said = json.loads(bytes(message.payload))
             if "stops" in said:
                 self.robot, self.status = sorted(held), said.get("stop")
+                self.status_s = time.monotonic()
 
     def agrees(self, held: list[str]) -> bool:
         """Whether relay and status say what the robot knows."""
         return self.relay == self.robot == held and (self.status or {}).get("id", "") in (held or [""])
 
 
-class Running:
-    """A client's ``run`` that can be ended."""
-
-    def __init__(self, work: Coroutine[Any, Any, None]) -> None:
-        self._task = asyncio.create_task(work)
-
-    async def end(self) -> None:
-        self._task.cancel()
-        await asyncio.wait([self._task])
-
-
 class Field:
     """The parties. ``shakes`` are further events by name: restarts of relays, of NATS."""
 
-    def __init__(self, links: tuple[Cuttable, Cuttable, Cuttable], watched: list[int], seed: int) -> None:
+    def __init__(self, links: Sequence[Cuttable], watched: list[int], seed: int, make: Make = Within) -> None:
         """Links of the robot and of both operators; ``watched`` are the ports of the relays."""
         self.links, self.chance, self.truth = links, random.Random(seed), Truth()
         self.shakes: dict[str, Callable[[], Awaitable[Any]]] = {}
-        self._body, self._waiting, self._number = Body(self.truth, self.chance), list[asyncio.Task[Any]](), 0
+        self._robot = make(self.truth, self.chance, f"ws://127.0.0.1:{links[0].port}")
+        self._waiting, self._number = list[asyncio.Task[Any]](), 0
+        self._watched = watched[0]
         self.watches = [Watch(f"ws://127.0.0.1:{port}") for port in watched]
         self._running: dict[str, Running] = {}
         self._ops: list[Session] = []
@@ -163,33 +74,45 @@ class Field:
             self._running[f"watch {k}"] = Running(watch.session.run())
         for k in range(2):
             self._ops.append(self._operator(k))
-        self._robot()
+        await self._robot.begin()
         self._running["monitor"] = Running(self._look())
+        self._running["driver"] = Running(self._hold_keys(self._watched))
         return self
 
     async def __aexit__(self, *_: object) -> None:
         for one in self._running.values():
             await one.end()
+        await self._robot.end()
 
     def _operator(self, k: int) -> Session:
         one = Session(f"ws://127.0.0.1:{self.links[1 + k].port}", f"op{k}")
         self._running[f"op{k}"] = Running(one.run())
         return one
 
-    def _robot(self) -> None:
-        self.robot = Robot(f"ws://127.0.0.1:{self.links[0].port}", "r", self._body, policy="drop-oldest")
-        self._body.robot = self.robot
-        self._running["robot"] = Running(self.robot.run())
+    async def _hold_keys(self, port: int) -> None:
+        """Somebody at a relay drives all the time, and lets the key go twice a second."""
+        while True:
+            with contextlib.suppress(OSError, EOFError, WebSocketException):
+                async with client(port, name="ann") as ann:
+                    for k in range(10**9):
+                        said = {"linear": 0.3 * (k % 10 < 7), "angular": 0.0, "for_ms": 200}
+                        stamp_us, payload = round(time.time() * 1e6), json.dumps(said).encode()
+                        await ann.put("/robots/r/drive", payload, encoding="json", stamp_us=stamp_us, sender="ann")
+                        await asyncio.sleep(0.05)
+            await asyncio.sleep(0.05)
 
     async def _look(self) -> None:
         """A stop that the robot has confirmed holds there until somebody begins to release it, over all restarts."""
         confirmed = set[str]()
         while True:
-            held = [stop.id for stop in self.robot.latch.ledger.held]
-            confirmed |= {stop["id"] for stop in self.robot.status()["stops"] if "released_us" not in stop}
+            held = self._robot.held()
+            confirmed |= self._robot.confirmed().union(*(watch.robot or () for watch in self.watches))
             for id in self.truth.standing():
                 if id in confirmed and not covers(held, id):
-                    self.truth.wrong.append(f"lost: stop {id} at the robot")
+                    said = [(watch.relay, watch.robot) for watch in self.watches]
+                    self.truth.wrong.append(
+                        f"lost: stop {id} at the robot, which holds {held}; relay and status: {said}"
+                    )
                     confirmed.discard(id)
             await asyncio.sleep(0.005)
 
@@ -199,11 +122,14 @@ class Field:
         goal = self.truth.goals[id] = Goal(time.monotonic())
         self.truth.counts["goals"] += 1
         try:
-            await operator.command("/robots/r/command", {"command": "goal", "id": id})
+            await self._robot.send(operator, id)
         except BufgymError as error:
             goal.answer = str(error)
         else:
             goal.answer = ""
+            until_s = time.monotonic() + self._robot.latency_s
+            while not self.truth.done[id] and time.monotonic() < until_s:
+                await asyncio.sleep(0.005)
             if not self.truth.done[id]:
                 self.truth.wrong.append(f"acked: goal {id} was not executed")
         return goal.answer
@@ -229,17 +155,19 @@ class Field:
     def _begin(self, work: Coroutine[Any, Any, Any]) -> None:
         self._waiting.append(asyncio.create_task(work))
 
-    async def _shake(self) -> None:
-        """One break, mend or restart."""
-        chance = self.chance
-        kind = chance.choice(["cut", "freeze", "mend", "robot", "operator", *self.shakes])
+    async def _shake(self, kind: str = "") -> None:
+        """One break, mend or restart, drawn at random unless it is given."""
+        chance, restarts = self.chance, self._robot.restarts
+        kind = kind or chance.choice(["cut", "freeze", "mend", *restarts, "operator", *self.shakes])
         self.truth.counts[kind] += 1
         match kind:
             case "cut" | "freeze" | "mend":
                 getattr(chance.choice(self.links), kind)()
-            case "robot":
-                await self._running["robot"].end()
-                self._robot()
+            case _ if kind in restarts:
+                await wait(kind, restarts[kind]())
+                until_s = time.monotonic() + self._robot.start_s * (chance.random() < 0.5)
+                while not self._is_here() and time.monotonic() < until_s:
+                    await asyncio.sleep(0.02)
             case "operator":
                 k = chance.randrange(2)
                 await self._running[f"op{k}"].end()
@@ -247,10 +175,10 @@ class Field:
             case _:
                 await wait(kind, self.shakes[kind]())
 
-    async def round(self) -> None:
-        """Shakes with orders between them; then all meet, and what must hold is looked at."""
+    async def round(self, first: str = "") -> None:
+        """Shakes, of which the first may be given, with orders between them; then all meet, and nothing is wrong."""
         chance = self.chance
-        for _ in range(chance.randrange(1, 6)):
+        for k in range(chance.randrange(1, 6)):
             for _ in range(chance.randrange(5)):
                 operator, kind = chance.choice(self._ops), chance.random()
                 if kind < 0.6:
@@ -260,7 +188,7 @@ class Field:
                 elif held := chance.choice(self.watches).relay:
                     self._begin(self._release(operator, chance.sample(held, chance.randint(1, len(held)))))
                 await asyncio.sleep(chance.uniform(0, 0.03))
-            await self._shake()
+            await self._shake(first if k == 0 else "")
             await asyncio.sleep(chance.choice([0.0, chance.uniform(0, 0.1), LATE_S * (chance.random() < 0.3)]))
         await self._meet()
         self.truth.counts["rounds"] += 1
@@ -269,17 +197,22 @@ class Field:
     async def _meet(self) -> None:
         for link in self.links:
             link.mend()
-        clients = [self.robot.client, *self._ops, *(watch.session for watch in self.watches)]
-        await until("all are here", lambda: all(one.ready.is_set() for one in clients))
+        clients = [*self._ops, *(watch.session for watch in self.watches)]
+        await until("all are here", lambda: self._is_here() and all(one.ready.is_set() for one in clients))
         await wait("all answers", asyncio.gather(*self._waiting))
         self._waiting.clear()
         await self._agree()
-        held = self._held()
+        held = self._robot.held()
+        until_s = time.monotonic() + STANDS_S
+        while held and self.truth.linear and time.monotonic() < until_s:
+            await asyncio.sleep(0.01)
+        if held and self.truth.linear:
+            self.truth.wrong.append(f"moves on at {self.truth.linear}, while stops hold: {held}")
         lost = [id for id in self.truth.standing() if not covers(held, id)]
         self.truth.wrong += [f"lost: stop {id}" for id in lost]
         over = [id for id, said in self.truth.stops.items() if said.released_s is not None]
         self.truth.wrong += [f"back: stop {id}" for id in held if id in over]
-        while held := self._held():
+        while held := self._robot.held():
             await self._release(self.chance.choice(self._ops), held)
             await asyncio.sleep(0.02)
         for operator in self._ops:
@@ -288,7 +221,7 @@ class Field:
                 await asyncio.sleep(0.05)
                 assert self.truth.counts["tries"] < 1000 * (1 + self.truth.counts["rounds"]), why
         await self._agree()
-        self.truth.wrong += [f"back: stop {id}" for id in self._held()]
+        self.truth.wrong += [f"back: stop {id}" for id in self._robot.held()]
         for id, goal in self.truth.goals.items():
             if goal.answer and self.truth.done[id] and not any(words in goal.answer for words in OPEN):
                 self.truth.wrong.append(f"refused, but executed: goal {id}: {goal.answer}")
@@ -296,12 +229,12 @@ class Field:
         self.truth.stops.clear()
         self.truth.released.clear()
 
-    def _held(self) -> list[str]:
-        return sorted(stop.id for stop in self.robot.latch.ledger.held)
+    def _is_here(self) -> bool:
+        return self._robot.is_here(max(watch.status_s for watch in self.watches))
 
     async def _agree(self) -> None:
         try:
-            await until("all agree", lambda: all(watch.agrees(self._held()) for watch in self.watches))
+            await until("all agree", lambda: all(watch.agrees(self._robot.held()) for watch in self.watches))
         except TimeoutError:
             said = [(watch.relay, watch.robot, watch.status) for watch in self.watches]
-            raise AssertionError(f"the robot has {self._held()}, others say {said}") from None
+            raise AssertionError(f"the robot has {self._robot.held()}, others say {said}") from None

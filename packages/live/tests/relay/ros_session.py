@@ -2,6 +2,7 @@
 
 node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer
 viewer --/robots/r/to/speech, goal_pose, initialpose, cmd_vel and /robots/r/drive--> node
+viewer --/robots/r/to/unheard--> nobody
 """
 
 import asyncio
@@ -120,7 +121,7 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
         url = f"ws://127.0.0.1:{server.port}"
         words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
         words += ["--odom", "odom", "--policies", "drop-oldest"]
-        words += [word for topic in hear for word in ("--receive", topic)]
+        words += [word for topic in (*hear, "unheard") for word in ("--receive", topic)]
         robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)
         viewer = Session(url, "viewer", say=lambda text: print(text, file=sys.stderr))
         viewer.subscribe("^/robots/r/chatter$", came.append)
@@ -132,6 +133,7 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
                 await command("/robots/r/to/speech", b"\0\1\0\0\xff\xff\xff\xff", TEXT)
                 await command("/robots/r/to/speech", b"", "no_such_msgs/msg/B")
                 await command("/robots/r/to/private", cdr("secret"), TEXT)
+                await command("/robots/r/to/unheard", cdr("nobody subscribes to this"), TEXT)
                 for text in COMMANDS:
                     await command("/robots/r/to/speech", cdr(text), TEXT)
                 await until("what was said", lambda: len(heard) >= len(COMMANDS))
@@ -154,6 +156,7 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
         "exact": all(bytes(message.payload) in {cdr(text) for text in sent} for message in came),
         "kinds": sorted({(message.encoding, message.type) for message in came}),
         "heard": heard,
+        "unheard": [why.partition("not published: ")[2] for why in refusals if "/to/unheard: " in why],
         "location": next(filter(None, location)),
         **places,
         "moves": moves,

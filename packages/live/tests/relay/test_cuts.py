@@ -3,14 +3,11 @@
 No goal is executed after its deadline, nor one that stood behind a stop; after a stop a key that is held moves nothing.
 """
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+import ros_program
 from loop_cases import beside, compiled
 from needs import needs
 
@@ -24,7 +21,6 @@ from bufgym_live.relay import backoff  # noqa: E402
 from bufgym_live.relay.robot import Robot  # noqa: E402
 
 pytestmark = compiled
-HERE = Path(__file__).resolve().parent
 CUTS = [6, pytest.param(100, marks=pytest.mark.nightly)]
 
 
@@ -58,15 +54,5 @@ async def test_a_made_up_robot(cuts: int, monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("cuts", CUTS)
 @pytest.mark.parametrize("version", ["1", "2"])
 def test_a_robot_of_ros(version: str, cuts: int, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    if version == "1":
-        where = request.getfixturevalue("ros")
-    else:
-        pytest.importorskip("rclpy", reason=needs("ros2", "rclpy"))
-        where = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    folders = HERE, HERE.parent, HERE.parents[1], HERE.parents[3] / "tests", HERE.parents[3] / "examples"
-    places = [where.get("PYTHONPATH", ""), *map(str, folders)]
-    where = {**where, "PYTHONPATH": os.pathsep.join(filter(None, places))}
-    words = [sys.executable, str(HERE / "ros_cuts_session.py"), version, str(tmp_path), str(cuts), str(cuts)]
-    ended = subprocess.run(words, env=where, capture_output=True, text=True, check=False, timeout=600)
-    assert ended.returncode == 0, ended.stderr
-    assert json.loads(ended.stdout.splitlines()[-1]) == {"cuts": cuts, "stops": (cuts + 1) // 4}
+    seen, _ = ros_program.run(request, "ros_cuts_session.py", version, tmp_path, cuts, cuts)
+    assert seen == {"cuts": cuts, "stops": (cuts + 1) // 4}

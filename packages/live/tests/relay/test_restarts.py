@@ -5,34 +5,31 @@ No stop is lost and none comes back; no goal is executed late, twice, or while a
 
 import asyncio
 import contextlib
-from collections import Counter
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import ros_program
 from loop_cases import beside, compiled
 from needs import needs
 
 for library in ("websockets", "re2"):
     pytest.importorskip(library, reason=needs("extras", library))
 
-from cut_cases import cuttable  # noqa: E402
 from nats_cases import connected, nats_server, needs_server  # noqa: E402
 from relay_cases import process, settings, until, wait  # noqa: E402
-from restart_story import DEADLINE_S, Field  # noqa: E402
+from restart_cases import RULE, begun, play, played  # noqa: E402
+from restart_truth import DEADLINE_S  # noqa: E402
 from test_stops import COMMAND, Program  # noqa: E402
 
 from bufgym.utils.errors import BufgymError  # noqa: E402
 from bufgym_live.relay import Nats, backoff, claims  # noqa: E402
 from bufgym_live.relay.config import Config, Rule  # noqa: E402
 from bufgym_live.relay.robot import Robot  # noqa: E402
-from bufgym_live.relay.server import Server  # noqa: E402
 from bufgym_live.relay.session import Session  # noqa: E402
 from bufgym_live.robot.sockets import free_port  # noqa: E402
 
 pytestmark = compiled
-RULE = Rule(address="127.0.0.0/8", send=True, receive=True, command_s=DEADLINE_S)
 OTHERS = Rule(nats=True, send=True, receive=True, topic="/robots/.*", command_s=DEADLINE_S)
 ROUNDS = [4, pytest.param(200, marks=pytest.mark.nightly)]
 FEW_ROUNDS = [2, pytest.param(200, marks=pytest.mark.nightly)]
@@ -44,54 +41,6 @@ def _quick(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(backoff, "MOST_S", 0.05)
     monkeypatch.setattr(claims, "SILENT_S", 1.0)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-
-
-class Relay:
-    """A relay that can be started anew, on the same port and with the same folder."""
-
-    def __init__(self, config: Config) -> None:
-        self.config = config
-
-    async def begin(self) -> None:
-        self.server = Server(self.config)
-        await wait("a relay's start", self.server.start())
-
-    async def end(self) -> None:
-        await wait("a relay's end", self.server.close())
-
-    async def again(self) -> None:
-        await self.end()
-        await self.begin()
-
-
-@contextlib.asynccontextmanager
-async def begun(config: Config) -> AsyncIterator[Relay]:
-    one = Relay(config)
-    await one.begin()
-    try:
-        yield one
-    finally:
-        await one.end()
-
-
-@contextlib.asynccontextmanager
-async def played(robot: int, operators: int, seed: int) -> AsyncIterator[Field]:
-    """Robot and operators at relays of these ports; in the end nothing that must not be has been."""
-    async with contextlib.AsyncExitStack() as stack:
-        links = [await stack.enter_async_context(cuttable(port)) for port in (robot, operators, operators)]
-        one = Field((links[0], links[1], links[2]), sorted({robot, operators}), seed)
-        async with one:
-            yield one
-
-
-async def play(one: Field, rounds: int, seed: int) -> Counter[str]:
-    try:
-        for _ in range(rounds):
-            await one.round()
-    finally:
-        print(f"seed {seed}: {dict(one.truth.counts)} {one.truth.wrong}", flush=True)
-    assert one.truth.counts["rounds"] == rounds
-    return one.truth.counts
 
 
 @long
@@ -159,6 +108,15 @@ async def test_two_relays_over_nats(rounds: int, tmp_path: Path, seed: int = 3) 
         field = await stack.enter_async_context(played(ports[1], ports[0], seed))
         field.shakes |= {"near relay": relays[0].again, "far relay": relays[1].again, "NATS": nats_again}
         await play(field, rounds, seed)
+
+
+@long
+@pytest.mark.parametrize("rounds", [2, pytest.param(100, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_a_robot_of_ros(version: str, rounds: int, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """Its process is ended and killed. What it executes is what another node hears of it."""
+    seen, _ = ros_program.run(request, "ros_restarts_session.py", version, tmp_path, rounds, rounds, limit_s=1150)
+    assert seen["rounds"] == rounds and seen["robot ended"] and seen["robot killed"] and seen["goals executed"]
 
 
 @needs_server

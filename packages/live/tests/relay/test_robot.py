@@ -3,9 +3,6 @@
 import asyncio
 import json
 import math
-import os
-import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import ros_program
 from loop_cases import beside, compiled
 from made_up_robot import HALF_M, ODOMETRY, PICTURE, SCAN, MadeUp, Pose, cast, jpeg, odometry, picture, pose_at, scan
 from needs import needs
@@ -251,11 +249,11 @@ def test_what_a_recording_lacks(tmp_path: Path) -> None:
 
 # --- robots of ROS: what a node publishes arrives byte by byte, and commands become messages of ROS ------------------
 
-HERE = Path(__file__).resolve().parent
 SEEN = {
     "exact": True,
     "kinds": [["cdr", "std_msgs/msg/String"]],
     "heard": [str(k) for k in range(8)],
+    "unheard": ["nobody here subscribes to /unheard"],
     "location": {"x": 3.0, "y": 0.0, "yaw": 0.0, "frame": "map"},
     "goal": ["map", 1.5],
     "pose": ["map", -2.0],
@@ -270,15 +268,6 @@ It moves as a stop says, as somebody drives it, and not any more once the link i
 @pytest.mark.nightly
 @pytest.mark.parametrize("version", ["1", "2"])
 def test_a_robot_of_ros(version: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    if version == "1":
-        where = request.getfixturevalue("ros")
-    else:
-        pytest.importorskip("rclpy", reason=needs("ros2", "rclpy"))
-        where = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    places = [where.get("PYTHONPATH", ""), *map(str, (HERE, HERE.parent, HERE.parents[1], HERE.parents[3] / "tests"))]
-    where = {**where, "PYTHONPATH": os.pathsep.join(filter(None, places))}
-    words = [sys.executable, str(HERE / "ros_session.py"), version, str(tmp_path)]
-    done = subprocess.run(words, env=where, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert "not published" in done.stderr
-    assert json.loads(done.stdout.splitlines()[-1]) == SEEN
+    seen, errors = ros_program.run(request, "ros_session.py", version, tmp_path, limit_s=300)
+    assert "not published" in errors
+    assert seen == SEEN

@@ -20,7 +20,7 @@ from bufgym_live.relay.wire import Message
 from bufgym_live.robot.shaped import ShapedLink
 
 REPO = Path(__file__).resolve().parents[4]
-PAGE = (REPO / "docs/guide/relay-wire.md").read_text(encoding="utf-8")
+PAGE = (REPO / "packages/live/bufgym_live/relay/PROTOCOL.md").read_text(encoding="utf-8")
 CLIENT = REPO / "examples/relay_client.js"
 IS_THERE = "process.exit(typeof WebSocket === 'undefined' ? 1 : 0)"
 
