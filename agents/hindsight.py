@@ -69,7 +69,7 @@ class School:
 
     def __init__(self, settings: Hindsight, families: int, seconds: float) -> None:
         self.settings, self.longest = settings, seconds
-        self.student = Student(settings.candidates, settings.width, settings.ruled)
+        self.student = Student(settings.candidates, settings.width)
         """The latest weights."""
         average = get_ema_multi_avg_fn(MEAN)  # type: ignore[no-untyped-call]
         self.mean = AveragedModel(self.student, multi_avg_fn=average)
@@ -169,7 +169,7 @@ class HindsightLearner(Learner[Hindsight]):
             school.load(checkpoint)
         # Every session has a seed of its own, by its first step: the episodes before a kill do not come again.
         rng = np.random.default_rng([seed, school.steps])
-        rows = TaughtRows(parts, settings.candidates, settings.ruled, rng)
+        rows = TaughtRows(parts, settings.candidates, rng)
         families = len(rows.families)
         lessons = Lessons(families, settings.room // families, (rows.seen.shape[1], rows.decisions.shape[1]))
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.ruled_network import RememberingWeights, fields_seen, seen
 
 START = 2.0
@@ -18,37 +17,30 @@ LAYERS = 0, 2, 4
 class Student(nn.Sequential):
     """Outputs [n, actions] of what n environments with k candidates show at arrivals; two hidden layers of ``width``.
 
-    Where the rule's decision is an action, ``ruled``, one unit of each layer begins as a switch: the rule decides on
-    steady links, in bursts, and where sizes differ.
+    One unit of each layer begins as a switch: the rule decides while the link is steady.
     """
 
-    def __init__(self, candidates: int, width: int, ruled: bool = False) -> None:
-        size = int(seen(candidates)) if ruled else inputs(candidates)
-        first, second = nn.Linear(size, width), nn.Linear(width, width)
-        out = nn.Linear(width, candidates + 2 + ruled)
-        unit = nn.ReLU if ruled else nn.Tanh  # where the rule is asked as well, tanh would take as long again
-        super().__init__(first, unit(), second, unit(), out)
-        self.ruled, self.candidates, self.activation = ruled, candidates, "relu" if ruled else "tanh"
+    def __init__(self, candidates: int, width: int) -> None:
+        first, second = nn.Linear(int(seen(candidates)), width), nn.Linear(width, width)
+        out = nn.Linear(width, candidates + 3)
+        super().__init__(first, nn.ReLU(), second, nn.ReLU(), out)  # tanh would take as long as all the rest
+        self.candidates = candidates
         nn.init.zeros_(out.weight)
         nn.init.zeros_(out.bias)
         with torch.no_grad():
             out.bias[0] = START
-            if ruled:
-                names = fields_seen(candidates)
-                for layer in first, second:
-                    layer.weight[0], layer.bias[0] = 0.0, 0.0
-                first.bias[0] = -1.0
-                first.weight[0, names.index("rule_plain")] = 2.0
-                first.weight[0, names.index("rule_size_spread")] = 10.0
-                second.weight[0, 0] = 1.0
-                out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
+            for layer in first, second:
+                layer.weight[0], layer.bias[0] = 0.0, 0.0
+            first.bias[0] = -1.0
+            first.weight[0, fields_seen(candidates).index("rule_plain")] = 2.0
+            second.weight[0, 0] = 1.0
+            out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 
-    def weights(self) -> CandidateWeights:
+    def weights(self) -> RememberingWeights:
         """The weights as in a file."""
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
-        kind = RememberingWeights if self.ruled else CandidateWeights
-        return kind(self.candidates, at_arrivals=True, masks=True, activation=self.activation, layers=layers)
+        return RememberingWeights(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
 
 
 def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

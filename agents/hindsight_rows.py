@@ -16,7 +16,6 @@ from bufgym.envs.expert.player import Player, as_actions
 from bufgym.envs.options import Options
 from bufgym.envs.sub_envs import SubEnvs
 from bufgym.oracle.hindsight import Hindsight
-from bufgym.policies.candidate_network import inputs
 from bufgym.policies.ruled_network import NOT_OFFERED, seen, watched, watcher
 
 Choose = Callable[[NDArray[np.float32], NDArray[np.bool_]], NDArray[np.int64]]
@@ -52,11 +51,10 @@ class TaughtRows:
     Args:
         parts: the rows of each cell.
         candidates: k, of every row.
-        ruled: whether the rule's decision is an action, and what it knows is seen.
         rng: for episodes.
     """
 
-    def __init__(self, parts: Sequence[Part], candidates: int, ruled: bool, rng: np.random.Generator) -> None:
+    def __init__(self, parts: Sequence[Part], candidates: int, rng: np.random.Generator) -> None:
         self.families = list(dict.fromkeys(part.family for part in parts))
         sizes = [part.rows for part in parts]
         self.n, ends = sum(sizes), np.cumsum(sizes).tolist()
@@ -74,8 +72,8 @@ class TaughtRows:
             self._teachers.append(Hindsight(sub_envs.senders, "train.py hindsight"))
         self._ruled = np.concatenate([np.arange(size) < max(size // RULED, size > 1) for size in sizes])
         self._candidates = candidates
-        self.seen = np.zeros((self.n, seen(candidates) if ruled else inputs(candidates)), np.float32)
-        self.decisions = np.zeros((self.n, candidates + 2 + ruled), np.int64)
+        self.seen = np.zeros((self.n, seen(candidates)), np.float32)
+        self.decisions = np.zeros((self.n, candidates + 3), np.int64)
         """int64[n, actions]: the slot action that each action stands for, ``NOT_OFFERED`` where it is not offered."""
         for sub_envs in self.groups:
             for i in range(len(sub_envs)):

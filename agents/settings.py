@@ -237,11 +237,6 @@ class Hindsight(Settings):
         return self.sets.kind if self.sets.families else super().kind
 
     @property
-    def ruled(self) -> bool:
-        """Whether the decision of gap-price is an action: where one network learns from many families of links."""
-        return self.kind != "environment"
-
-    @property
     def resolved(self) -> "Hindsight":
         """The same without zeros that stand for numbers by the task."""
         usual: dict[str, Any] = {"candidates": 2, "num_envs": 256, "batch_size": 1024}
