@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from bufgym.policies.ruled_network import RememberingWeights, fields_seen, seen
+from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
 
 START = 2.0
 """Bias of action 0 before learning, "accept where there is room, else drop the cheapest"; all other outputs are 0."""
@@ -36,11 +36,11 @@ class Student(nn.Sequential):
             second.weight[0, 0] = 1.0
             out.weight[-1, 0], out.weight[0, 0] = 2 * START, -START
 
-    def weights(self) -> RememberingWeights:
+    def weights(self) -> RuledWeights:
         """The weights as in a file."""
         numbers = {name: tensor.detach().numpy() for name, tensor in self.named_parameters()}
         layers = tuple((numbers[f"{k}.weight"].T.copy(), numbers[f"{k}.bias"].copy()) for k in LAYERS)
-        return RememberingWeights(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
+        return RuledWeights(self.candidates, at_arrivals=True, masks=True, activation="relu", layers=layers)
 
 
 def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:

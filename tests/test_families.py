@@ -17,7 +17,7 @@ from bufgym.jit import JIT
 from bufgym.oracle import EveryLength, integer, law
 from bufgym.policies import weights
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.ruled_network import RememberingWeights, seen
+from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.scenario import Interruption, Uplink
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
@@ -163,9 +163,9 @@ def test_the_page_compares_files_with_rules_and_an_older_agent(tmp_path: Path, m
     monkeypatch.setattr(families, "chosen", lambda data=None, only=(): found)
     first = np.zeros((seen(3), 4), np.float32), np.zeros(4, np.float32)
     last = np.zeros((4, 6), np.float32), np.array([0, 0, 0, 0, 0, 1], np.float32)  # the sixth action is the rule's
-    mine = RememberingWeights(3, True, True, "tanh", (first, last))
+    mine = RuledWeights(3, True, True, "tanh", (first, last))
     reject = np.zeros((4, 6), np.float32), np.array([0, 1, 0, 0, 0, 0], np.float32)  # the cheapest goes, room or not
-    old = RememberingWeights(3, True, True, "tanh", (first, reject))
+    old = RuledWeights(3, True, True, "tanh", (first, reject))
     made, before = tmp_path / "mine.safetensors", tmp_path / "old.safetensors"
     weights.save(made, mine, {"name": "learned", "training": "python train.py hindsight --families all", "seeds": [3]})
     weights.save(before, old, {"name": "old"})

@@ -19,7 +19,7 @@ from agents.learner import Learner, learner_of
 from agents.settings import Settings
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
-from bufgym.policies.ruled_network import RememberingWeights, seen
+from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.policies.weights import save
 
 
@@ -43,7 +43,7 @@ def test_a_network_is_kept_as_a_policy_that_decides_as_it_does(algo: str) -> Non
 
 FIRST = np.zeros((seen(3), 4), np.float32), np.zeros(4, np.float32)
 LAST = np.zeros((4, 6), np.float32), np.array([0, 0, 0, 0, 0, 1], np.float32)
-THE_RULE = RememberingWeights(3, True, True, "tanh", (FIRST, LAST))
+THE_RULE = RuledWeights(3, True, True, "tanh", (FIRST, LAST))
 """Its sixth action is the highest: what gap-price does."""
 
 

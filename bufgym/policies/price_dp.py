@@ -58,17 +58,10 @@ PARAMETERS = {
     "price_near": 3.66,
     "share_low": 5.0,
     "share_steep": 60.0,
-    "price_discount": 0.0,
-    "spare": 1.0,
-    "spare_discount": 0.0,
 }
 """Those of target-gap; the gap that may be left with room, in g; the head's own target, in g, and the weight of the gap
-that it would leave; the numbers of the price; those of the share; what dropping slot k of s is worth besides, in units,
-times 1 - k / s; and, without a target, the gap that may be left with room, in thinning's, and the discount."""
+that it would leave; the numbers of the price; those of the share."""
 THRESHOLD, HEAD, BIAS, KAPPA, TAIL, PRICE_THRESHOLD, PRICE_NEAR, SHARE_LOW, SHARE_STEEP = range(14, 23)
-PRICE_DISCOUNT, SPARE, SPARE_DISCOUNT = range(23, 26)
-UNUSED = ("price_discount", "spare", "spare_discount")
-"""Parameters that change nothing as they stand. Files of ``ruled_network.RuledWeights`` still name them."""
 LEAST_SHARE = 0.06
 """Smallest a that is not 0. Structural: equal sizes have 0.007, and are to be ``target-gap`` exactly."""
 UNPRICED = 1e-6
@@ -121,10 +114,10 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
         a = 0.0
     longest, discount = numbers[THRESHOLD] * g, numbers[DISCOUNT]
     if not known:
-        longest, discount = -g if a > 0 else -max(g, TINY), numbers[SPARE_DISCOUNT]
+        longest, discount = -g if a > 0 else -max(g, TINY), 0.0
         each_us, elapsed_us = spare_us(buffer, arrival), arrival.arrival_us - buffer.dequeued_arrival_us
         if each_us > 0 and not bursty(memory):
-            longest = numbers[SPARE] * ((arrival.x - buffer.dequeued_x) * each_us / elapsed_us)
+            longest = (arrival.x - buffer.dequeued_x) * each_us / elapsed_us
     per_unit, tie, per_gap = 0.0, 0.0, (1 - a) / max(g, TINY)
     if a > 0:
         chains.weigh(buffer, arrival, unit / mean_bytes(buffer, arrival), arrival.x + numbers[TAIL] * g, scratch)
@@ -144,7 +137,7 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers, a
     for k in range(s):
         gain = per_gap * (longest - discounted(buffer, arrival, False, k, discount))
         if a > 0:
-            gain += per_unit * chains.advantage(scratch, k) + a * numbers[PRICE_DISCOUNT] * (1 - k / s)
+            gain += per_unit * chains.advantage(scratch, k)
         if gain >= own - tie:
             freed_bytes += buffer.slots[k].size_bytes
         if gain > best + tie:

@@ -8,8 +8,6 @@ decision. Its network has an output for each action:
 
 and the highest output of those that are offered decides. On a link whose rate has not changed by over 10 % for
 ``EVEN_US`` and is steady, the rule alone is offered. See docs/methods.md, "Networks among candidates".
-
-``RuledWeights`` are older files, without the past: there a link is even by the variance of its log rate in 10 s.
 """
 
 import math
@@ -36,38 +34,24 @@ from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
 from bufgym.policies.past_inputs import N_PAST, NOTHING, PAST_INPUTS, PAST_NAMES, past_inputs
 from bufgym.policies.registry import Arrival, Memory, Policy
-from bufgym.policies.rule_inputs import (
-    BASE,
-    INPUT_FIELDS,
-    LOG_RATE_VARIANCE,
-    MEANINGS,
-    N_INPUTS,
-    REMEMBERED,
-    RULE,
-    inputs,
-    recall,
-)
-from bufgym.policies.target_gap import SEEN_US, bursty
+from bufgym.policies.rule_inputs import BASE, INPUT_FIELDS, MEANINGS, N_INPUTS, REMEMBERED, RULE, inputs, recall
+from bufgym.policies.target_gap import bursty
 from bufgym.policies.thinning import steady
 
 NOT_OFFERED = -100
 """In place of the decision of an action that is not offered."""
 OF_RULE = tuple(f"rule_{field.name}" for field in INPUT_FIELDS)
-EVEN_US, EVEN = 3e6, 2.5e-5
-"""How long a link must not have changed, us; for older files, how long it must have been measured, and the variance of
-its log rate below which it has not varied."""
+EVEN_US = 3e6
+"""How long a link must not have changed to be even, us."""
 STATE = ("room", "log_capacity")
 """1 if there is room for the newcomer; log(L / 8)."""
 PER_CANDIDATE, QUEUE, N_STATE = len(CANDIDATE_FIELDS), len(QUEUE_FIELDS), len(STATE)
 
 
 @kernel
-def seen(candidates: int, remembers: bool = True) -> int:
-    """The count of numbers observed: of candidates, the rule, ``STATE``, the past, whether each action is the rule's.
-
-    Networks of older files do not see the past.
-    """
-    return PER_CANDIDATE * (candidates + 1) + QUEUE + N_INPUTS + N_STATE + (N_PAST if remembers else 0) + candidates + 2
+def seen(candidates: int) -> int:
+    """The count of numbers seen: of candidates, the rule, ``STATE``, the past, whether each action is the rule's."""
+    return PER_CANDIDATE * (candidates + 1) + QUEUE + N_INPUTS + N_STATE + N_PAST + candidates + 2
 
 
 def fields_seen(candidates: int) -> list[str]:
@@ -87,15 +71,13 @@ def rule_decision(buffer: Buffer, arrival: Arrival, rule: Memory) -> int:
 
 
 @kernel
-def even(buffer: Buffer, memory: Memory, remembers: bool) -> bool:
+def even(buffer: Buffer) -> bool:
     """Whether the link has carried at one rate for ``EVEN_US``.
 
     Regret is so small there that a network which wavers once loses several times what the rule loses.
     """
-    if remembers:
-        past = buffer.past
-        return bool(past[CHANGED_US] > 0 and buffer.now_us - past[CHANGED_US] > EVEN_US and steady(buffer))
-    return bool(steady(buffer) and memory[LOG_RATE_VARIANCE] < EVEN and memory[RULE + SEEN_US] > EVEN_US)
+    past = buffer.past
+    return bool(past[CHANGED_US] > 0 and buffer.now_us - past[CHANGED_US] > EVEN_US and steady(buffer))
 
 
 @kernel
@@ -106,17 +88,13 @@ def left_to_rule(buffer: Buffer, memory: Memory) -> bool:
     free in hindsight, as the clairvoyant could still drop the right messages later; who accepts does not.
     """
     rule, is_saturating = memory[RULE:], buffer.v[0] == SATURATING
-    is_short = buffer.capacity <= 2
-    return bool(
-        is_short or is_saturating or price_dp.share(rule, BASE) > 0 or bursty(rule) or even(buffer, memory, True)
-    )
+    is_unequal = price_dp.share(rule, BASE) > 0
+    return bool(buffer.capacity <= 2 or is_saturating or is_unequal or bursty(rule) or even(buffer))
 
 
 @kernel
-def look(
-    buffer: Buffer, arrival: Arrival, memory: Memory, own: Memory, numbers: Singles, places: int, remembers: bool
-) -> None:
-    """Write what is seen into ``numbers``, the past if it ``remembers``.
+def look(buffer: Buffer, arrival: Arrival, memory: Memory, own: Memory, numbers: Singles, places: int) -> None:
+    """Write what is seen into ``numbers``.
 
     Order and cost of the ``places`` = k + 1 candidates and each action's decision go into ``own``. ``memory`` begins
     with the rule's, which is updated.
@@ -133,11 +111,10 @@ def look(
     at = of_candidates + N_INPUTS
     numbers[at], numbers[at + 1] = 1.0 if room else 0.0, math.log(buffer.capacity / 8)
     at += N_STATE
-    if remembers:
-        past_inputs(buffer, arrival, numbers[at : at + N_PAST])
-        at += N_PAST
+    past_inputs(buffer, arrival, numbers[at : at + N_PAST])
+    at += N_PAST
     decisions[actions - 1] = by_rule
-    alone = left_to_rule(buffer, memory) if remembers else even(buffer, memory, False)
+    alone = left_to_rule(buffer, memory)
     for a in range(actions - 1):
         decisions[a], numbers[at + a] = NOT_OFFERED, 0.0
         if not alone and is_offered(order, True, room, a):
@@ -145,15 +122,14 @@ def look(
             numbers[at + a] = 1.0 if decisions[a] == by_rule else 0.0
 
 
-@kernel
-def decide(buffer: Buffer, arrival: Arrival, memory: Memory, remembers: bool) -> int:
-    """The decision with the highest output."""
-    own = memory[len(memory) - own_numbers(buffer.parameters, remembers) :]
+def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
+    """A trained network that chooses among ordered candidates and what gap-price would do."""
+    own = memory[len(memory) - own_numbers(buffer.parameters) :]
     places = int(buffer.parameters[CANDIDATES]) + 1
     parameters, actions = buffer.parameters, places + 2
     decisions, units = own[2 * places : 2 * places + actions], own[2 * places + actions :].view(np.float32)
-    look(buffer, arrival, memory, own, units, places, remembers)
-    outputs = units[forward(parameters, units, seen(places - 1, remembers)) :]
+    look(buffer, arrival, memory, own, units, places)
+    outputs = units[forward(parameters, units, seen(places - 1)) :]
     best, decision = -np.inf, 0
     for a in range(actions):
         if decisions[a] != NOT_OFFERED and outputs[a] > best:
@@ -162,10 +138,10 @@ def decide(buffer: Buffer, arrival: Arrival, memory: Memory, remembers: bool) ->
 
 
 @kernel
-def own_numbers(parameters: NDArray[np.float64], remembers: bool) -> int:
+def own_numbers(parameters: NDArray[np.float64]) -> int:
     """How much of the memory's end the network takes."""
     places = int(parameters[CANDIDATES]) + 1
-    units = widest = seen(places - 1, remembers)
+    units = widest = seen(places - 1)
     for layer in range(int(parameters[HIDDEN]) + 1):
         units += int(parameters[WIDTHS + layer])
         if layer < int(parameters[HIDDEN]):
@@ -173,21 +149,11 @@ def own_numbers(parameters: NDArray[np.float64], remembers: bool) -> int:
     return 3 * places + 2 + singles(units + widest)
 
 
-def on_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """A trained network that chooses among ordered candidates and what gap-price would do."""
-    return decide(buffer, arrival, memory, True)
-
-
-def on_arrival_without_past(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
-    """The same of an older file."""
-    return decide(buffer, arrival, memory, False)
-
-
 def watch_arrival(buffer: Buffer, arrival: Arrival, memory: Memory) -> int:
     """What gap-price does; the memory ends with each action's decision and what the network would see."""
     places = int(buffer.parameters[CANDIDATES]) + 1
     own = memory[len(memory) - (3 * places + 2 + singles(seen(places - 1))) :]
-    look(buffer, arrival, memory, own, own[3 * places + 2 :].view(np.float32), places, True)
+    look(buffer, arrival, memory, own, own[3 * places + 2 :].view(np.float32), places)
     return int(own[3 * places + 1])
 
 
@@ -213,44 +179,28 @@ def watched(memory: Memory, candidates: int) -> tuple[NDArray[np.float64], Singl
 
 @dataclass(frozen=True)
 class RuledWeights(CandidateWeights):
-    """A network among ordered candidates and gap-price's decision that sees no past, as in a file."""
+    """A network among ordered candidates and gap-price's decision that sees the past, as in a file."""
 
-    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = (*CandidateWeights.CONTEXT_NAMES, *OF_RULE, *STATE)
-    NETWORKS: ClassVar[tuple[str, ...]] = ("ruled",)
-    REMEMBERS: ClassVar[bool] = False
+    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = (*CandidateWeights.CONTEXT_NAMES, *OF_RULE, *STATE, *PAST_NAMES)
+    NETWORKS: ClassVar[tuple[str, ...]] = ("remembering",)
 
     def policy(self, name: str, about: str = "", source: str = "") -> Policy:
         """Make the policy of these weights; it works for every L."""
         numbers = self.parameters()
-        work = chains.SCRATCH[0] + int(own_numbers(numbers, self.REMEMBERS)), chains.SCRATCH[1]
-        decides = on_arrival if self.REMEMBERS else on_arrival_without_past
+        work = chains.SCRATCH[0] + int(own_numbers(numbers)), chains.SCRATCH[1]
         return Policy(
-            name, decides, weights=tuple(numbers.tolist()), memory=REMEMBERED, work=work, compile=True,
-            built_in=True, reads_rate=True, reads_left=True, reads_past=self.REMEMBERS, about=about, source=source,
+            name, on_arrival, weights=tuple(numbers.tolist()), memory=REMEMBERED, work=work, compile=True,
+            built_in=True, reads_rate=True, reads_left=True, reads_past=True, about=about, source=source,
         )  # fmt: skip
 
     @staticmethod
     def definition(fields: Sequence[str]) -> list[Any]:
         """What defines observation and rule: weights found with others would decide nonsense."""
-        return [*CandidateWeights.definition(fields), MEANINGS, price_dp.PARAMETERS]
+        past = [(field.name, field.unit, field.meaning, NOTHING[field.name]) for field in PAST_INPUTS]
+        return [*CandidateWeights.definition(fields), MEANINGS, price_dp.PARAMETERS, past]
 
     @classmethod
     def ends(cls, settings: Mapping[str, Any]) -> tuple[int, int]:
         """How many numbers go in, and how many come out."""
         k = settings["candidates"]
-        return int(seen(k, cls.REMEMBERS)), k + 3
-
-
-class RememberingWeights(RuledWeights):
-    """A network among ordered candidates and gap-price's decision that sees the past, as in a file."""
-
-    CONTEXT_NAMES: ClassVar[tuple[str, ...]] = (*RuledWeights.CONTEXT_NAMES, *PAST_NAMES)
-    NETWORKS: ClassVar[tuple[str, ...]] = ("remembering",)
-    REMEMBERS: ClassVar[bool] = True
-
-    @staticmethod
-    def definition(fields: Sequence[str]) -> list[Any]:
-        """What defines observation and rule; numbers of the rule that change nothing may go without a new training."""
-        rule = {name: number for name, number in price_dp.PARAMETERS.items() if name not in price_dp.UNUSED}
-        past = [(field.name, field.unit, field.meaning, NOTHING[field.name]) for field in PAST_INPUTS]
-        return [*CandidateWeights.definition(fields), MEANINGS, rule, past]
+        return int(seen(k)), k + 3

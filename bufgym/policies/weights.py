@@ -18,7 +18,7 @@ from safetensors.numpy import save as serialized
 from bufgym.policies.candidate_network import CandidateWeights
 from bufgym.policies.learned import Weights
 from bufgym.policies.registry import Policy
-from bufgym.policies.ruled_network import RememberingWeights, RuledWeights
+from bufgym.policies.ruled_network import RuledWeights
 from bufgym.utils import __version__, strict_json
 from bufgym.utils.errors import BufgymError, where
 from bufgym.utils.files import read_whole, replaced
@@ -33,10 +33,11 @@ MAX_BYTES = 1 << 20  # Largest file accepted, bytes: a slot scorer has a few kil
 MAX_WIDTH = 256  # Most units of a hidden layer
 KEY = "bufgym"  # The entry of the header's metadata that holds the JSON text
 GONE = {
-    "scheduler": "gap-priority is that rule now, and python train.py tune gap-priority finds its numbers",
-    "guided": "gap-price is that rule now, and python train.py tune gap-price finds its numbers",
+    "scheduler": "numbers that moved a rule's: python train.py tune gap-priority finds such numbers now",
+    "guided": "numbers that moved a rule's: python train.py tune gap-price finds such numbers now",
+    "ruled": "a network that sees no past: python train.py hindsight makes one that does",
 }
-"""A network that files had -> what takes its place."""
+"""A network that files had -> what it was, and what takes its place."""
 WRITTEN = ("format", "fields", "observation", "bufgym", "sha256")  # Metadata that ``save`` itself writes
 
 
@@ -123,8 +124,8 @@ def _parsed(path: StrPath, data: bytes) -> tuple[AnyWeights, dict[str, Any]]:
     prefixes = {name.partition(".")[0] for name in entries}
     for network, now in GONE.items():
         if network in prefixes:
-            raise BufgymError(f"{path}: numbers that moved a rule's, as bufgym made them until 0.2: {now}")
-    kinds: tuple[Kind, ...] = (CandidateWeights, RuledWeights, RememberingWeights)
+            raise BufgymError(f"{path}: made by bufgym until 0.2: {now}")
+    kinds: tuple[Kind, ...] = (CandidateWeights, RuledWeights)
     kind = next((kind for kind in kinds if kind.NETWORKS[0] in prefixes), Weights)
     metadata = _metadata(path, data, kind)
     fields, settings = metadata["fields"], {name: metadata[name] for name in kind.SETTINGS}

@@ -13,7 +13,7 @@ from bufgym import policies
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.learned import Network, Weights
-from bufgym.policies.ruled_network import RememberingWeights, seen
+from bufgym.policies.ruled_network import RuledWeights, seen
 from bufgym.utils.errors import BufgymError
 
 
@@ -59,10 +59,10 @@ def random_choices(k, at_arrivals, *widths, masks=False, activation="tanh", seed
     )
 
 
-def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0, kind=RememberingWeights):
+def random_ruled(k, *widths, activation="tanh", seed=0, accept=0.0):
     """Of a network among k candidates, the head and what the rule does, inclined to its first action by ``accept``."""
-    layers = random_layers([seen(k, kind.REMEMBERS), *widths, k + 3], seed, accept)
-    return kind(k, True, True, activation, layers)
+    layers = random_layers([seen(k), *widths, k + 3], seed, accept)
+    return RuledWeights(k, True, True, activation, layers)
 
 
 KINDS = QUEUE, CHOICES = Weights, CandidateWeights

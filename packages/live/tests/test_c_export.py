@@ -17,7 +17,6 @@ from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.policies import Policy
 from bufgym.policies.learned import NAMES
-from bufgym.policies.ruled_network import RuledWeights
 from bufgym.scenario import Episode, messages
 from bufgym.sim import run
 from bufgym.sim.metrics import received
@@ -98,8 +97,7 @@ AGENTS |= {
     "among-candidates": random_choices(2, False, 64, 64, seed=7).policy("among-candidates"),
     "at-arrivals": random_choices(3, True, 6, 5, 4, activation="relu", seed=13, accept=4.0).policy("at-arrivals"),
     "masked": random_choices(5, True, masks=True, seed=16, accept=4.0).policy("masked"),
-    "ruled": random_ruled(3, 12, 7, seed=17, accept=1.0, kind=RuledWeights).policy("ruled"),
-    "remembering": random_ruled(3, 12, 7, seed=18, accept=1.0).policy("remembering"),
+    "ruled": random_ruled(3, 12, 7, seed=18, accept=1.0).policy("ruled"),
 }
 
 
