@@ -20,6 +20,7 @@ from agents.tasks import FAMILY_NAMES, Names
 from bufgym import policies
 from bufgym.benchmark.bootstrap import written as parts_of
 from bufgym.policies import Policy, weights
+from bufgym.policies.past_inputs import N_PAST
 from bufgym.policies.rule_inputs import N_INPUTS
 from bufgym.policies.ruled_network import EVEN_US, PER_CANDIDATE, QUEUE, RuledWeights
 from bufgym.utils.errors import BufgymError
@@ -31,7 +32,7 @@ from studies.page import command, publish
 SHIPPED = Path("agents/pretrained/learned.safetensors")
 FOLDER = Path("runs/judged")
 """Where bounds and the planner's runs are kept."""
-TRAINING = "python train.py hindsight --families all --steps 4000000 --validate-every 400000 --seed 1"
+TRAINING = "python train.py hindsight --families all --data DIR --steps 4000000 --seed 1"
 
 PAGE = """# learned
 
@@ -40,15 +41,15 @@ the rule `gap-price`. It was made by `{made}`{seed}.
 
 - *Sees* the {k} candidates that are cheapest to drop and the head, each by {per_candidate} numbers, and {queue} numbers
   of queue and link (`bufgym.model.observe.candidates`). Beside these it sees the rule's {rule} inputs
-  (`bufgym.policies.rule_inputs.INPUTS`), whether there is room, log(L / 8), and which actions are the rule's: {seen}
-  numbers in all. Where there is no odometry, x is the frame's index.
+  (`bufgym.policies.rule_inputs.INPUTS`), {past} of the past of link and camera and of the stream's end, where the
+  robot was told it (`bufgym.policies.past_inputs`), whether there is room, log(L / 8), and which actions are the
+  rule's: {seen} numbers in all. Where there is no odometry, x is the frame's index.
 - *Does* one of {actions} actions: accept, or drop the cheapest where there is no room; drop one of the candidates or
   the head; do what `gap-price` does. It is asked at every arrival, and takes the action with the highest output among
   the actions that are offered.
-- *Keeps to the rule* on a link that has not varied for {even:.0f} seconds: there the rule alone is offered.
+- *Leaves to the rule* steady links whose rate has not changed by 10 % for {even:.0f} seconds, queues of one or two
+  places, messages in bursts or of unequal bytes, and a V that saturates.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
-- *Sizes differ*: there it does what `gap-price` does. `bufgym bench --policies gap-price,learned --sizes jpeg` says
-  whether their rows are the same.
 - *Falls short* of a rule, on a row below, by an interval without zero: {short}.
 - *Trained* on {families} families of links and streams at once. [Training](guide/training.md) says how.
 
@@ -144,6 +145,7 @@ def _described(network: RuledWeights, notes: Mapping[str, Any]) -> dict[str, Any
         "per_candidate": PER_CANDIDATE,
         "queue": QUEUE,
         "rule": N_INPUTS,
+        "past": N_PAST,
         "seen": len(network.layers[0][0]),
         "actions": widths[-1],
         "even": EVEN_US / 1e6,
