@@ -1,4 +1,4 @@
-"""What each algorithm of ``train.py`` reaches after some seconds: the table of docs/guide/hyperparameters.md.
+"""What each algorithm of ``train.py`` reaches after some seconds, with its settings.
 
 python -m studies.hyperparameters --env bufgym/Uplink-v0 --seconds 10 60 --algorithms hindsight ppo
 

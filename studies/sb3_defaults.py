@@ -1,4 +1,4 @@
-"""How far the trainers of stable-baselines3 come by their own defaults: the curves of docs/guide/trainers.md.
+"""How far the trainers of stable-baselines3 come by their own defaults: the curves of docs/guide/trainers-results.md.
 
 python -m studies.sb3_defaults --trainers PPO DQN A2C MaskablePPO --reward regret --steps 200000
 python -m studies.sb3_defaults --reward paired --repeat 3 --rows 8 --seeds 0 1 2 3 4 5 6 7 8 9 --steps 300000

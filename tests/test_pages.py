@@ -190,7 +190,6 @@ ELSEWHERE = {
     "docs/guide/ros1.md": "packages/live/tests/robot/test_ros1.py",
     "docs/guide/ros2.md": "packages/live/tests/robot/test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
-    "docs/guide/trainers.md": "tests/test_trainers.py",
     "docs/guide/yours-to-change.md": "below",
     "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }

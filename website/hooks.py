@@ -34,9 +34,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {name: text.encode() for name, text in pages.made().items()} | tutorials.made()
     for name, content in made.items():
         files.append(File.generated(config, name, content=content))
-    for example in sorted((REPO / "examples").iterdir()):
-        if example.is_file():
-            files.append(File.generated(config, f"examples/{example.name}", abs_src_path=str(example)))
+    for example in sorted((REPO / "examples").rglob("*")):
+        if example.is_file() and example.suffix != ".pyc":
+            name = example.relative_to(REPO).as_posix()
+            files.append(File.generated(config, name, abs_src_path=str(example)))
     return files
 
 
