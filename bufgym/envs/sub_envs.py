@@ -253,7 +253,7 @@ class SubEnvs:
         }
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``INFOS``."""
+        """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``Options.info``."""
         info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
         if self.choices is not None and self._shows_mask:
             info["slots"] = self.output.slot_actions[i].copy()
