@@ -2,7 +2,7 @@
 
     python -m studies.learned --data DIR
     python -m studies.learned runs/new/learned.safetensors --against agents/pretrained/learned.safetensors --data DIR
-    python -m studies.learned --data DIR --planner --out docs/agents.md
+    python -m studies.learned --data DIR --planner --out results/agents.md
 
 Without a file it judges the agent that ships. ``--against`` names another agent of any kind, with which the first is
 compared in pairs. ``--planner`` adds the hindsight planner. ``--only task,lte`` judges on these families alone, and
@@ -180,7 +180,7 @@ def main(
         only: families to judge on, such as task,lte; by default all but unequal, whose bounds take minutes.
         planner: whether the hindsight planner plays as well, on some runs of task and lte.
         folder: where bounds and the planner's runs are kept.
-        out: a Markdown file for the page of the agent that ships, such as docs/agents.md.
+        out: a Markdown file for the page of the agent that ships, such as results/agents.md.
     """
     chosen, makers = files or (SHIPPED,), families.chosen(data, only)
     network, notes = weights.read(chosen[0]) if out else (None, {})

@@ -25,7 +25,9 @@ from website import policies as policy_page
 REPO = Path(__file__).resolve().parent.parent
 WRITTEN = [
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", "agents/pretrained/README.md", "traces/README.md"),
+    "packages/papers/PERCEPTION.md",
     *(path.relative_to(REPO).as_posix() for path in sorted((REPO / "docs").rglob("*.md"))),
+    *(path.relative_to(REPO).as_posix() for path in sorted((REPO / "results").glob("*.md"))),
 ]
 """Pages that are files. (The changelog names commands of its day.)"""
 
@@ -192,7 +194,6 @@ ELSEWHERE = {
     "docs/guide/own-policy.md": "above, by a command",
     "docs/guide/trainers.md": "tests/test_trainers.py",
     "docs/guide/yours-to-change.md": "below",
-    "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }
 """Page -> what runs its programs."""
 
