@@ -43,9 +43,9 @@ The generator is `bufgym/traces/generate/markov.py`. Its parameters are in `{fil
 `bufgym/traces/fit.py` fits them.
 
 Medians and ranges are over {sets} sets; rows with p < {level} are in bold.
-[How to read the tables](../docs/methods.md#how-links-are-fitted-to-recordings). Each mode begins with its parameters: the
-shares of the variance of the rates' normal scores that stay for a whole trace (*place*), for a while (*level*), and for a
-second (*fast*).
+[How to read the tables](../docs/methods.md#how-links-are-fitted-to-recordings). Each mode begins with its parameters:
+the shares of the variance of the rates' normal scores that stay for a whole trace (*place*), for a while (*level*), and
+for a second (*fast*).
 """
 
 

@@ -128,6 +128,18 @@ def test_links_and_pictures_lead_somewhere() -> None:
                 assert not anchor or anchor in anchors or 'id="' in text, (page, target)
 
 
+def test_what_a_docstring_cites_is_a_title_of_that_page() -> None:
+    sources = [path for top in ("bufgym", "packages", "agents", "studies") for path in (REPO / top).rglob("*.py")]
+    cited = [
+        (path, page, " ".join(title.split()))
+        for path in sources
+        for page, title in re.findall(r'([\w/]+\.md),\s+"([^"]+)"', path.read_text(encoding="utf-8"))
+    ]
+    assert len(cited) > 20
+    for path, page, title in cited:
+        assert f"# {title}\n" in (REPO / page).read_text(encoding="utf-8"), (path, page, title)
+
+
 RUN = {
     r"bufgym bench --policies learned,afr": "--seconds 2 --seeds 1",
     r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",

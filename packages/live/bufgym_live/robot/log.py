@@ -1,7 +1,7 @@
 """Log of a live queue's events, with enough detail to repeat every decision in the simulator.
 
-A record is a small dictionary with its time, ``us``. In a file it is a JSON message of an MCAP recording, on the channel
-of its event:
+A record is a small dictionary with its time, ``us``. In a file it is a JSON message of an MCAP recording, on the
+channel of its event:
 
     settings  policy, parameters, capacity, max_bytes, v, decide_at, topics, window, ends_us
     put       seq, size_bytes, x, topic, uniform, carried: bytes that the link had carried by then
