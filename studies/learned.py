@@ -50,7 +50,7 @@ the rule `gap-price`. It was made by `{made}`{seed}.
 - *Sizes differ*: there it does what `gap-price` does. `bufgym bench --policies gap-price,learned --sizes jpeg` says
   whether their rows are the same.
 - *Falls short* of a rule, on a row below, by an interval without zero: {short}.
-- *Trained* on {families} families of links and streams at once. [Training](guide/training.md) says how.
+- *Trained* on {families} families of links and streams at once. [Training](../docs/guide/training.md) says how.
 
 """
 TEST = """```
@@ -80,7 +80,7 @@ Parts of rows:
 """
 PLANNER = """
 The hindsight planner (`studies/causal_planner.py`) on some of these runs. It knows the law of links and motion, and
-`learned` does not; it is slow, and [the truth](guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
+`learned` does not. It is slow; [the truth](../docs/guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
 
 {shares}
 
