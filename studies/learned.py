@@ -80,7 +80,7 @@ Parts of rows:
 """
 PLANNER = """
 The hindsight planner (`studies/causal_planner.py`) on some of these runs. It knows the law of links and motion, and
-`learned` does not. It is slow; [the truth](../docs/guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
+`learned` does not. It is slow: [truth](../docs/guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
 
 {shares}
 
