@@ -62,7 +62,7 @@ fuzz: $(READY)
 claims: $(READY)
 	mkdir -p build
 	$(BIN)/python -m bufgym reproduce --claims build/claims.md $(if $(DATA),--data $(DATA))
-	$(BIN)/python .ci/claims.py docs/claims.md build/claims.md
+	$(BIN)/python .ci/claims.py results/claims.md build/claims.md
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict

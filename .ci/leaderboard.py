@@ -1,4 +1,4 @@
-"""Check docs/leaderboard.csv: ``leaderboard.py stale``, ``sample N`` or ``COMMIT``; 1 if a row does not hold.
+"""Check results/leaderboard.csv: ``leaderboard.py stale``, ``sample N`` or ``COMMIT``; 1 if a row does not hold.
 
 ``stale`` runs nothing. It names the rows whose policy has changed since they were made. ``sample`` runs N rows that the
 date draws. COMMIT runs each row that differs from that commit's. A row whose suite needs recordings is named and left
@@ -15,7 +15,7 @@ from pathlib import Path
 from bufgym.benchmark import leaderboard
 from bufgym.scenario.suites import SUITES
 
-FILE = Path("docs/leaderboard.csv")
+FILE = Path("results/leaderboard.csv")
 
 
 def name_stale() -> int:

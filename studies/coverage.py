@@ -1,4 +1,4 @@
-"""How often 95 % intervals cover: the table of docs/guide/suites.md, "Intervals".
+"""How often 95 % intervals cover: the table of docs/guide/suites.md, "Intervals and shares".
 
 python -m studies.coverage --links 2 4 6 8 16 40 --repetitions 2000
 

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from bufgym.cli.options import Whole
 from bufgym.utils.errors import BufgymError, printable
 
-DEFAULT = "docs/leaderboard.csv"
+DEFAULT = "results/leaderboard.csv"
 
 
 def report(folder: str, /, *, markdown: bool = False) -> None:

@@ -186,18 +186,18 @@ def test_a_row_whose_policy_changed_is_stale(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, board = tmp_path / "board.csv", REPO / "docs" / "leaderboard.csv"
+    path, board = tmp_path / "board.csv", REPO / "results" / "leaderboard.csv"
     leaderboard.write([], path)
     fails(["validate", "lte-v1/nobody", "--file", board], "no row 'lte-v1/nobody'", capsys)
     monkeypatch.chdir(tmp_path)
-    fails(["validate", "lte-v1/afr"], "docs/leaderboard.csv is that of bufgym's repository", capsys)
+    fails(["validate", "lte-v1/afr"], "results/leaderboard.csv is that of bufgym's repository", capsys)
     fails(["leaderboard", "no-suite", "--file", path], "no-suite", capsys)
     refuse(r"written to a \.csv file", leaderboard.write, [], tmp_path / "board.txt")
 
 
 @pytest.mark.nightly
 def test_a_published_row_holds() -> None:
-    entry = leaderboard.find(REPO / "docs" / "leaderboard.csv", "sustained-v1/min-motion-gap")
+    entry = leaderboard.find(REPO / "results" / "leaderboard.csv", "sustained-v1/min-motion-gap")
     assert leaderboard.validate(entry, jobs=1).values["score"] == pytest.approx(entry.values["score"], abs=1e-12)
 
 
