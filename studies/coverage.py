@@ -205,7 +205,7 @@ def _plain(found: Trainings, freedom: float) -> tuple[float, float]:
 
 def of_levels(found: Trainings) -> tuple[float, float]:
     """What bufgym prints."""
-    one = together([interval(found.of_links, found.links), interval(found.of_seeds, found.seeds)])
+    one = together([(found.of_links, found.links), (found.of_seeds, found.seeds)])
     return one.low, one.high
 
 

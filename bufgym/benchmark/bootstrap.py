@@ -18,7 +18,10 @@ from bufgym.benchmark.episodes import Episode, Numbers
 from bufgym.benchmark.table import NONE
 
 RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0  # Resamples, confidence of the intervals and seed of the draws
-REALS = -math.inf, math.inf
+Range = tuple[float, float]
+REALS: Range = (-math.inf, math.inf)
+NOT_NEGATIVE: Range = (0.0, math.inf)
+SHARES: Range = (0.0, 1.0)  # Of probabilities, regrets and all that counts a part of something
 ROUNDING = 1e-12  # Numbers up to this size are 0: sums of the same terms in another order
 
 
@@ -113,9 +116,7 @@ def students_t(confidence: float, freedom: int) -> float:
     return math.sqrt(freedom) * math.tan(low)
 
 
-def interval(
-    numbers: Numbers, links: int, confidence: float = CONFIDENCE, within: tuple[float, float] = REALS
-) -> Interval:
+def interval(numbers: Numbers, links: int, confidence: float = CONFIDENCE, within: Range = REALS) -> Interval:
     """Compute the interval of a statistic from its [1 + resamples] numbers; NaN, an undefined one, is left out.
 
     It is the wider of two, both made for few ``links``. One is the bootstrap's standard error times a quantile of
@@ -133,27 +134,36 @@ def interval(
     reach = errors * float(np.std(drawn))
     level = NormalDist().cdf(-errors)
     low, high = np.quantile(drawn, [level, 1 - level]).tolist()
-    return Interval(value, max(min(low, value - reach), within[0]), min(max(high, value + reach), within[1]))
+    return _kept(Interval(value, min(low, value - reach), max(high, value + reach)), within)
 
 
-def together(levels: Sequence[Interval], within: tuple[float, float] = REALS) -> Interval:
-    """Join intervals of one statistic over independent levels of chance, such as links and training seeds.
+def _kept(found: Interval, within: Range) -> Interval:
+    """The interval, of which no bound leaves ``within``."""
+    value, low, high = found
+    return Interval(value, min(max(low, within[0]), value), max(min(high, within[1]), value))
 
-    Each level's interval is that of drawing this level alone, and has degrees of freedom of its own. To either side
-    the reaches add as squares (Zou and Donner 2008, "Construction of confidence limits about effect measures: a general
-    approach", Statistics in Medicine 27). Of two normal means the joint interval holds the true value at least as often
-    as each level's does, however few each level has (Banerjee 1961, Sankhya 23). Chance that both levels see, such as
-    how well one agent does on one link, counts twice. No bound leaves ``within``.
+
+def together(levels: Sequence[tuple[Numbers, int]], within: Range = REALS) -> Interval:
+    """Compute the interval of a statistic over independent levels of chance, such as links and training seeds.
+
+    Each level has the numbers found by drawing it alone, [1 + resamples], and how many units were drawn, so that it
+    has degrees of freedom of its own. One that the statistic does not depend on has the sample's number alone.
+
+    To either side the reaches of the levels' intervals add as squares (Zou and Donner 2008, "Construction of confidence
+    limits about effect measures: a general approach", Statistics in Medicine 27). For two normal means this holds the
+    true value at least as often as each level's interval does, however few units each level has (Banerjee 1961,
+    Sankhya 23). Chance that both levels see, such as how well one agent does on one link, counts twice.
     """
-    value, low, high = levels[0]
-    moving = [level for level in levels[1:] if not max(level.high - level.value, level.value - level.low) <= ROUNDING]
-    if moving:
-        low = value - math.hypot(value - low, *(level.value - level.low for level in moving))
-        high = value + math.hypot(high - value, *(level.high - level.value for level in moving))
-    return Interval(value, max(low, within[0]), min(high, within[1]))
+    value, low, high = interval(*levels[0])
+    others = [interval(numbers, units) for numbers, units in levels[1:] if len(numbers) > 1]
+    if others:
+        low = value - math.hypot(value - low, *(other.value - other.low for other in others))
+        high = value + math.hypot(high - value, *(other.high - other.value for other in others))
+    return _kept(Interval(value, low, high), within)
 
 
 def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
     """Divide ``above`` by ``below`` where ``defined``; NaN elsewhere."""
-    quotient: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
+    shape = np.broadcast_shapes(above.shape, below.shape)
+    quotient: Numbers = np.divide(above, below, out=np.full(shape, np.nan), where=defined)
     return quotient

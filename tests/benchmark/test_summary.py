@@ -15,7 +15,7 @@ from sweep_cases import exactly
 from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
 
 from bufgym.benchmark import leaderboard, report
-from bufgym.benchmark.bootstrap import interval, links_drawn, links_in, stream, students_t, times_drawn
+from bufgym.benchmark.bootstrap import interval, links_drawn, links_in, stream, students_t, times_drawn, together
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
 from bufgym.benchmark.report import tables
@@ -220,8 +220,8 @@ def test_links_are_drawn_jointly_by_hand() -> None:
     h = {"drop-oldest": [0] * 4, "mine": 10 * won}
     rows = [row for s in ("time", "motion") for row in rows_of(h, [10] * 4, traces=["a", "a", "b", "b"], scenario=s)]
     made = scores(rows)
-    assert standing_of(made, "mine")["score"] == interval(jointly, 2)
-    assert cell_of(made, "mine", "time").qoi == pytest.approx(interval(10 * jointly, 2))
+    assert standing_of(made, "mine")["score"] == interval(jointly, 2, within=(-np.inf, 1))
+    assert cell_of(made, "mine", "time").qoi == pytest.approx(interval(10 * jointly, 2, within=(0, np.inf)))
 
 
 def test_an_interval_by_hand() -> None:
@@ -241,11 +241,35 @@ def test_an_interval_by_hand() -> None:
     assert np.isnan(interval(numbers, 1)[1:]).all()
 
 
-@pytest.mark.parametrize("freedom", [*range(1, 13), 39, 400])
 @pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
-def test_students_t_is_that_of_scipy(confidence: float, freedom: int) -> None:
-    expected = scipy.stats.t.ppf((1 + confidence) / 2, freedom)
-    assert students_t(confidence, freedom) == pytest.approx(expected, rel=0.012)
+def test_students_t_is_that_of_scipy(confidence: float) -> None:
+    assert students_t(0.95, 3) == pytest.approx(3.182446305284263, rel=1e-10)  # Student's table has 3.182
+    for freedom in [*range(1, 61), 399, 400, 10_001]:
+        expected = scipy.stats.t.ppf((1 + confidence) / 2, freedom)
+        assert students_t(confidence, freedom) == pytest.approx(expected, rel=1e-9)
+
+
+def test_links_and_trainings_together_by_hand() -> None:
+    """Nine links reach 2.446 to either side, as above; four trainings sqrt(4 / 3) x 3.182 = 3.675: together 4.414."""
+    moving = np.array([0.0] + [-1.0, 1.0] * 500)
+    assert together([(moving, 9), (moving, 4)]) == pytest.approx((0, -4.414, 4.414), abs=1e-3)
+    assert together([(moving, 9), (moving, 4)], within=(-1, 1)) == (0, -1, 1)
+    # What a statistic does not depend on adds nothing, and no level is left out for being unknown.
+    assert together([(moving, 9), (moving[:1], 4), (np.zeros(9), 4)]) == interval(moving, 9)
+    assert np.isnan(together([(moving, 1), (moving, 4)])[1:]).all()
+    # The reaches to the two sides are joined apart: where links have a long tail upwards, so has the whole.
+    skewed = np.array([0.0] + [0.0] * 98 + [10.0] * 2)
+    both, alone = together([(skewed, 9), (moving, 4)]), interval(skewed, 9)
+    assert both.high == pytest.approx(np.hypot(alone.high, 3.675), abs=1e-3) and both.high > -both.low
+
+
+def test_no_bound_leaves_its_range() -> None:
+    """Robots above: of 4 episodes, 3 have all robots above and one none, so 75 %, where t alone would reach 155 %."""
+    numbers = links_drawn({"one": [("a", k) for k in range(4)]})["one"] @ np.array([1.0, 1, 1, 0]) / 4
+    assert interval(numbers, 4).high > 1.5
+    assert interval(numbers, 4, within=(0, 1)) == (0.75, 0, 1)
+    # Rounding may put the number itself outside; its interval still has it.
+    assert interval(np.full(9, 1 + 1e-9), 9, within=(0, 1)) == pytest.approx((1, 1, 1), abs=1e-8)
 
 
 def test_links_are_counted_where_there_are_fewest() -> None:
@@ -266,7 +290,7 @@ def test_a_link_with_more_seeds_weighs_more() -> None:
     drawn = links_drawn({"one": [("a", 0), ("a", 1), ("a", 2), ("b", 0)]})["one"]
     means = drawn @ np.array([2.0, 2, 2, 6]) / drawn.sum(axis=1)
     assert set(means) == {2, 3, 6}
-    assert (low, high) == interval(means, 2)[1:] and low < 2 and high > 6
+    assert (low, high) == interval(means, 2, within=(0, np.inf))[1:] and low == 0 and high > 6  # H is never below 0
 
 
 def test_share_of_afrs_regret_and_its_paired_difference_by_hand() -> None:
