@@ -37,7 +37,7 @@ def test_intervals_over_trainings_cover_where_degrees_of_links_fall_short(seeds:
     old, ours = list(coverage.LEVELS)[0], list(coverage.LEVELS)[-1]
     for statistic in coverage.STATISTICS:
         assert found[ours, statistic][0] >= 0.92  # 93 %, less the error of 400 samples
-        assert found[old, statistic][0] < (0.8 if seeds == 2 else found[ours, statistic][0])
+        assert found[old, statistic][0] < (0.85 if seeds == 2 else found[ours, statistic][0])
 
 
 def test_without_a_spread_between_trainings_links_alone_count() -> None:
@@ -48,10 +48,12 @@ def test_without_a_spread_between_trainings_links_alone_count() -> None:
 
 
 def test_rare_links_carry_most_of_the_loss() -> None:
-    """12 of 100 links with 100 times the loss: 1,200 of 1,288 parts."""
-    pool = np.array([[99.0, 100.0]] * 100)
-    loss = (lambda rare: rare[:, -1:] - rare)(coverage.with_rare(pool, 0.12))[:, 0]
-    assert loss[:12].sum() / loss.sum() == pytest.approx(1200 / 1288)
+    """A policy loses half as much as Drop Oldest. On 12 of 100 links 100 times as much: 1,200 of 1,244 parts."""
+    pool = np.array([[98.0, 99.0, 100.0]] * 100)
+    rare = coverage.with_rare(pool, 0.12)
+    loss = (rare[:, -1:] - rare) / 2
+    assert loss[:12, 1].sum() == 1200 and loss[12:, 1].sum() == 44
+    assert (coverage.with_rare(pool, 0) - pool == coverage.with_rare(pool, 0)[0, 0] - 98).all()
 
 
 def test_it_prints_a_row_for_each_way(capsys: pytest.CaptureFixture[str]) -> None:

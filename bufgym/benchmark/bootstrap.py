@@ -72,13 +72,39 @@ def links_drawn(
     draws: dict[int, Numbers] = {}
     counts = {}
     for scenario, met in episodes.items():
-        links = _links(met)
-        place = {link: k for k, link in enumerate(sorted(set(links)))}
-        n = len(place)
+        places = places_of(met)
+        n = max(places) + 1
         draws.setdefault(n, times_drawn(n, resamples, stream(seed, f"{n} links")))
         # In the order of ``times_drawn``, so that sums over row 0 round as they do there.
-        counts[scenario] = np.ascontiguousarray(draws[n][:, [place[link] for link in links]])
+        counts[scenario] = np.ascontiguousarray(draws[n][:, places])
     return counts
+
+
+def places_of(met: Sequence[Episode]) -> list[int]:
+    """Which of the drawn links each episode belongs to, counted from 0 in the order of their names."""
+    links = _links(met)
+    place = {link: k for k, link in enumerate(sorted(set(links)))}
+    return [place[link] for link in links]
+
+
+def carriers(losses: Numbers) -> int:
+    """How few links carry half of the loss; ``losses`` has that of each link."""
+    most = np.cumsum(np.sort(losses.clip(0))[::-1])
+    return int(np.searchsorted(most, most[-1] / 2 * (1 - ROUNDING))) + 1
+
+
+def remark(losses: Numbers, loser: str, drawn: str) -> list[str]:
+    """A note where one or two of those ``drawn``, a quarter of all at most, carry half of what ``loser`` loses.
+
+    What such rare links do decides about all sums, and a sample that has none of them shows nothing of it: no interval
+    made of the sample alone can know. ``studies.coverage --rare`` simulates it.
+    """
+    few = carriers(losses)
+    if few > 2 or 4 * few > len(losses):
+        return []
+    carry = "carries" if few == 1 else "carry"
+    what = f"{few} of {len(losses)} {drawn} {carry} half of what {loser} loses"
+    return [f"note: {what}: intervals over so few may hold the true number far less often than 95 %"]
 
 
 def _links(met: Sequence[Episode]) -> list[Any]:

@@ -14,7 +14,7 @@ Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -33,7 +33,9 @@ from bufgym.benchmark.bootstrap import (
     Range,
     links_drawn,
     links_in,
+    places_of,
     ratio,
+    remark,
     stream,
     times_drawn,
     together,
@@ -102,6 +104,7 @@ class Scores:
 
     standings: list[Standing]  # ranked policies first, best score first
     cells: list[CellScore]  # by scenario, capacity, policy
+    remarks: tuple[str, ...] = ()  # on the sample of links
 
     @property
     def counted(self) -> int:
@@ -130,28 +133,40 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     by_links, *by_training = (_level(table, discriminative, trained, against) for trained in ("", *several))
     levels = dict(zip(several, by_training, strict=True))
 
-    def joined(policy: str, key: str, links: int, numbers: Callable[[_Level], Numbers]) -> Interval:
+    def joined(policy: str, key: str, links: int, cell: Cell | None = None) -> Interval:
         on = [name for name in dict.fromkeys((policy, REFERENCE, against)) if name in several]
-        units = [(numbers(by_links), links), *((numbers(levels[name]), several[name]) for name in on)]
-        return together(units, RANGES.get(key, REALS))
+        drawn = [(by_links.of(policy, key, cell), links)]
+        drawn += [(levels[name].of(policy, key, cell), several[name]) for name in on]
+        return together(drawn, RANGES.get(key, REALS))
 
     cell_scores: list[CellScore] = []
     for policy, cell in product(table.training_seeds, table.cells):
         met = table.episodes[cell[0]]
-        qoi, found, regrets, more = (
-            joined(policy, key, links_in({cell[0]: met}), lambda level: getattr(level.cells[policy, cell], key))  # noqa: B023
-            for key in ("qoi", "score", "regret", "difference")
-        )
+        links = links_in({cell[0]: met})
+        found = [joined(policy, key, links, cell) for key in ("qoi", "score", "regret", "difference")]
         counts, exact = cell in discriminative, table.exact[cell]
-        cell_scores.append(CellScore(*cell, policy, len(met), qoi, found, regrets, more, counts, exact))
+        cell_scores.append(CellScore(*cell, policy, len(met), *found, counts, exact))
     links = links_in({scenario: table.episodes[scenario] for scenario, _ in discriminative})
     standings = []
     for policy, values in by_links.overall.items():
-        intervals = {key: joined(policy, key, links, lambda level: level.overall[policy][key]) for key in values}  # noqa: B023
+        intervals = {key: joined(policy, key, links) for key in values}
         standings.append(Standing(policy, unranked.get(policy, ""), intervals))
     cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
     standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
-    return Scores(standings, cell_scores)
+    return Scores(standings, cell_scores, tuple(_remarks(table, discriminative)))
+
+
+def _remarks(table: Arrays, discriminative: Sequence[Cell]) -> list[str]:
+    """Remark on links that carry half of the reference's regret, where all scenarios have the same links."""
+    loser = REFERENCE if REFERENCE in table.training_seeds else BASELINE
+    losses = []
+    for cell in discriminative:
+        lost = (table.best[cell] - table.qoi[loser, cell].mean(axis=0)) / table.best[cell].sum()
+        losses.append(np.bincount(places_of(table.episodes[cell[0]]), lost))
+    if len({len(of_cell) for of_cell in losses}) != 1 or np.sum(losses) <= NEGLIGIBLE:
+        return []
+    traces = {trace for scenario, _ in discriminative for trace, _ in table.episodes[scenario]}
+    return remark(np.sum(losses, axis=0), loser, "links" if len(traces) > 1 else "episodes")
 
 
 class _Level(NamedTuple):
@@ -159,6 +174,13 @@ class _Level(NamedTuple):
 
     cells: Mapping[tuple[str, Cell], _Statistics]
     overall: Mapping[str, dict[str, Numbers]]  # over the discriminative cells
+
+    def of(self, policy: str, key: str, cell: Cell | None) -> Numbers:
+        """One statistic in a cell, or over all."""
+        if cell is None:
+            return self.overall[policy][key]
+        numbers: Numbers = getattr(self.cells[policy, cell], key)
+        return numbers
 
 
 def _level(table: Arrays, discriminative: Sequence[Cell], trained: str, against: str) -> _Level:

@@ -55,7 +55,7 @@ class Summary:
     """The same in each cell, cells in the order of the rows; empty where ``scores`` holds them."""
     baseline: str  # the policy that the others are measured against
     scores: Scores | None = None  # scores between the baseline and the clairvoyant, where one is known
-    notes: tuple[str, ...] = ()  # sentences about single policies, below the ranking
+    notes: tuple[str, ...] = ()  # sentences about single policies, or the links, below the ranking
 
     @property
     def standings(self) -> dict[str, Standing]:

@@ -15,7 +15,17 @@ from sweep_cases import exactly
 from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
 
 from bufgym.benchmark import leaderboard, report
-from bufgym.benchmark.bootstrap import interval, links_drawn, links_in, stream, students_t, times_drawn, together
+from bufgym.benchmark.bootstrap import (
+    carriers,
+    interval,
+    links_drawn,
+    links_in,
+    remark,
+    stream,
+    students_t,
+    times_drawn,
+    together,
+)
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
 from bufgym.benchmark.report import tables
@@ -270,6 +280,25 @@ def test_no_bound_leaves_its_range() -> None:
     assert interval(numbers, 4, within=(0, 1)) == (0.75, 0, 1)
     # Rounding may put the number itself outside; its interval still has it.
     assert interval(np.full(9, 1 + 1e-9), 9, within=(0, 1)) == pytest.approx((1, 1, 1), abs=1e-8)
+
+
+def test_a_remark_where_few_links_carry_half_of_the_loss() -> None:
+    """Of six links one loses 10 of 15; of eight two lose 4 + 4 of 14. Two of six, or two of four equal ones, are many."""
+    assert [carriers(np.array(losses)) for losses in ([10.0, 1, 1, 1, 1, 1], [4.0, 4, 1, 1, 1, 1], [1.0] * 6)] == [
+        1,
+        2,
+        3,
+    ]
+    (one,) = remark(np.array([10.0, 1, 1, 1, 1, 1]), "afr", "links")
+    assert one.startswith("note: 1 of 6 links carries half of what afr loses: ")
+    assert "2 of 8 episodes carry half" in remark(np.array([4.0, 4, 1, 1, 1, 1, 1, 1]), "afr", "episodes")[0]
+    for usual in ([4.0, 4, 1, 1, 1, 1], [1.0] * 6, [2.0, 1, 0], [1.0] * 4):
+        assert remark(np.array(usual), "afr", "links") == []
+    best = [20.0] * 6
+    uneven = {"drop-oldest": [10.0] * 6, "afr": [10.0, 19, 19, 19, 19, 19]}
+    rows = rows_of(uneven, best, traces=list("abcdef"))
+    task = TASKS["queue"]
+    assert task.summary(rows).notes == (one,) and task.summary(rows_of({**uneven, "afr": [18] * 6}, best)).notes == ()
 
 
 def test_links_are_counted_where_there_are_fewest() -> None:
