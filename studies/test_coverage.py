@@ -34,7 +34,7 @@ def test_the_products_intervals_cover_where_percentiles_fall_short(links: int) -
 def test_intervals_over_trainings_cover_where_degrees_of_links_fall_short(seeds: int) -> None:
     rng = np.random.default_rng(seeds)
     found = coverage.coverage_of_trainings(made_up_pool(), 24, seeds, 0.1, 400, 200, rng)
-    old, ours = list(coverage.LEVELS)[0], list(coverage.LEVELS)[-1]
+    old, *_, ours = coverage.LEVELS
     for statistic in coverage.STATISTICS:
         assert found[ours, statistic][0] >= 0.92  # 93 %, less the error of 400 samples
         assert found[old, statistic][0] < (0.85 if seeds == 2 else found[ours, statistic][0])

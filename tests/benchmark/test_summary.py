@@ -283,7 +283,7 @@ def test_no_bound_leaves_its_range() -> None:
 
 
 def test_a_remark_where_few_links_carry_half_of_the_loss() -> None:
-    """Of six links one loses 10 of 15; of eight two lose 4 + 4 of 14. Two of six, or two of four equal ones, are many."""
+    """Of six links one loses 10 of 15; of eight two lose 4 + 4 of 14. Two of six, or of four equal ones, are many."""
     assert [carriers(np.array(losses)) for losses in ([10.0, 1, 1, 1, 1, 1], [4.0, 4, 1, 1, 1, 1], [1.0] * 6)] == [
         1,
         2,
