@@ -29,8 +29,8 @@ def test_the_score_after_so_many_steps_is_that_of_the_rollout_that_reaches_them(
     assert first == "| PPO, regret | 0.30 " and low == pytest.approx(0.3 - 1.27, abs=0.05)
     assert lines[2].endswith(", 1.00] | 0.20, 0.40 | 25 |")
     assert lines[3:] == [
-        "| DQN, retained, 8 rows, generated-v1, L = 16, slots | 0.50 [-] | 0.50 | 9 |",
-        "| PPO, paired, 8 rows, held for 3 | 0.60 [-] | 0.60 | 40 |",
+        "| DQN, retained, 8 rows, generated-v1, L = 16, slots | 0.50 [–] | 0.50 | 9 |",
+        "| PPO, paired, 8 rows, held for 3 | 0.60 [–] | 0.60 | 40 |",
         "| afr | 0.30 |  |  |",
         "| chance | -0.10 |  |  |",
     ]

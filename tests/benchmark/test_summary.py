@@ -14,7 +14,7 @@ from refusal_cases import refuse
 from sweep_cases import exactly
 from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
 
-from bufgym.benchmark import leaderboard, report
+from bufgym.benchmark import bootstrap, leaderboard, report
 from bufgym.benchmark.bootstrap import (
     carriers,
     interval,
@@ -192,6 +192,22 @@ def test_a_row_whose_policy_changed_is_stale(monkeypatch: pytest.MonkeyPatch) ->
     fingerprints._of_one.cache_clear()
     monkeypatch.setattr(target_gap, "SHORT_QUEUE", target_gap.SHORT_QUEUE + 1)
     assert leaderboard.stale(known) == ["lte-v1/target-gap", "outage-v1/target-gap"]
+    fingerprints._of_one.cache_clear()
+
+
+def test_a_page_whose_statistics_changed_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another constant of theirs is planted: the page that was stamped before is named, and stamped anew it is not."""
+    table = "| afr | 0.346 [0.301, 0.391] |\n"
+    pages = {Path("made.md"): leaderboard.stamped(table), Path("old.md"): table, Path("words.md"): "See [0] and [1].\n"}
+    now = leaderboard.statistics()
+    assert [leaderboard.statistics_of(text) for text in pages.values()] == [now, leaderboard.UNKNOWN, None]
+    assert pages[Path("made.md")] == f"{table}\n<!-- statistics {now} -->\n"
+    assert leaderboard.stale_pages(pages) == []
+    fingerprints._of_one.cache_clear()
+    monkeypatch.setattr(bootstrap, "ROUNDING", 1e-9)
+    assert leaderboard.statistics() != now and leaderboard.stale_pages(pages) == [Path("made.md")]
+    again = leaderboard.stamped(pages[Path("made.md")])
+    assert again.count("<!--") == 1 and leaderboard.stale_pages({Path("made.md"): again}) == []
     fingerprints._of_one.cache_clear()
 
 
