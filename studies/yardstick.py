@@ -1,6 +1,6 @@
 """Which episodes separate the best rule from constant actions: the table of docs/guide/suites.md.
 
-python -m studies.yardstick --suites lte-v1 sustained-v1 generated-v1 outage-v1 switching-v1 --capacities 5 8 16 --seeds 1
+python -m studies.yardstick --suites lte-v1 sustained-v1 generated-v1 outage-v1 switching-v1 --seeds 1
 
 An agent that is level with a constant action may have learned nothing. So episodes say something of learning where the
 best rule is above the better constant action, in the share of AFR's regret that each leaves, by more than its interval.

@@ -143,9 +143,10 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     for policy, cell in product(table.training_seeds, table.cells):
         met = table.episodes[cell[0]]
         links = links_in({cell[0]: met})
-        found = [joined(policy, key, links, cell) for key in ("qoi", "score", "regret", "difference")]
+        of = {key: joined(policy, key, links, cell) for key in ("qoi", "score", "regret", "difference")}
         counts, exact = cell in discriminative, table.exact[cell]
-        cell_scores.append(CellScore(*cell, policy, len(met), *found, counts, exact))
+        known = of["qoi"], of["score"], of["regret"], of["difference"]
+        cell_scores.append(CellScore(*cell, policy, len(met), *known, counts, exact))
     links = links_in({scenario: table.episodes[scenario] for scenario, _ in discriminative})
     standings = []
     for policy, values in by_links.overall.items():
