@@ -239,7 +239,7 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
             axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=one.label if n == 0 else None)
     at_level: dict[float, list[str]] = {}
     for name, score in rules.items():
-        at_level.setdefault(round(score, 3), []).append(name)
+        at_level.setdefault(round(score, 2), []).append(name)  # closer ones would be written over each other
     for score, names in at_level.items():
         axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
         axes.annotate(
