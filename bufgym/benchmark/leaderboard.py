@@ -3,6 +3,7 @@
 import hashlib
 import io
 import math
+import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -11,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from bufgym import policies
-from bufgym.benchmark import folder
+from bufgym.benchmark import bootstrap, folder, score
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
-from bufgym.benchmark.summary import places, shown
+from bufgym.benchmark.summary import places, shown, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import task_of
@@ -79,6 +80,40 @@ def made_of(spec: str) -> str:
     numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
     digest = hashlib.sha256(repr((fingerprints, numbers)).encode()).hexdigest()
     return f"{sys.implementation.cache_tag}-{digest[:12]}"
+
+
+STATISTICS = (
+    *(bootstrap.interval, bootstrap.together, bootstrap.links_drawn, bootstrap.students_t.__wrapped__),
+    *(score.scores, score._Sample.of.__func__, score._Sample.sums, summarise),  # type: ignore[attr-defined]
+)
+"""Functions that make the intervals and shares of all pages; what they call counts, too."""
+_STAMP = re.compile(r"<!-- statistics (\S+) -->\n?")
+_BRACKETS = re.compile(r"\[[-+−]?\d*\.?\d+, [-+−]?\d*\.?\d+\]")
+
+
+def statistics() -> str:
+    """Hash of how intervals and shares are computed, of the kind of ``made_of``."""
+    parts = repr([fingerprint(function) for function in STATISTICS])
+    return f"{sys.implementation.cache_tag}-{hashlib.sha256(parts.encode()).hexdigest()[:12]}"
+
+
+def stamped(text: str) -> str:
+    """A page of results that was just made, with a comment at its end that says by which statistics."""
+    return f"{_STAMP.sub('', text).rstrip()}\n\n<!-- statistics {statistics()} -->\n"
+
+
+def statistics_of(text: str) -> str | None:
+    """By which statistics a page says it was made; ``UNKNOWN`` if it has intervals alone, None without any."""
+    found = _STAMP.search(text)
+    return found[1] if found else UNKNOWN if _BRACKETS.search(text) else None
+
+
+def stale_pages(pages: Mapping[Path, str]) -> list[Path]:
+    """Those pages, by their text, that say they were made by other statistics than today's, as far as they compare."""
+    here, now = f"{sys.implementation.cache_tag}-", statistics()
+    return [
+        page for page, text in pages.items() if (made := statistics_of(text) or "").startswith(here) and made != now
+    ]
 
 
 def stale(board: Mapping[str, Entry]) -> list[str]:
