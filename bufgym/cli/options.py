@@ -69,6 +69,7 @@ Seeds = Annotated[
     int, checked(int, lambda number: 1 <= number <= MAX_EPISODES, f"a whole number >= 1 and at most {MAX_EPISODES}")
 ]
 Positive = Annotated[float, checked(float, lambda number: 0 < number < math.inf, "a number > 0")]
+PerSecond = Annotated[float, checked(float, lambda rate: 0.01 <= rate <= 1000, "a number from 0.01 to 1000")]
 Least0 = Annotated[float, checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")]
 Capacities = Annotated[
     tuple[int, ...],
