@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bufgym import scenario as scenarios
+from bufgym import scenario as registered
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
 from bufgym.benchmark.report import tables
@@ -22,11 +22,12 @@ from bufgym.benchmark.sweep import Sweep
 from bufgym.policies import Policy, registry
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
+from bufgym.scenario.suites.own import own_suite
 from bufgym.scenario.texts import doubts
 from bufgym.utils.errors import BufgymError, unknown
 from bufgym.utils.files import write_text
 from bufgym.utils.libraries import library
-from bufgym.utils.modules import is_named
+from bufgym.utils.modules import find, is_named
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "label", "against", "out", "form")
 OF_A_QUEUE = ("max_bytes", "decide_at", "bound")
@@ -151,13 +152,14 @@ def compare(
         raise BufgymError("policies = []: need at least one")
     capacities = (capacity,) if isinstance(capacity, int) else tuple(capacity or ())
     on = os.fspath(on) if isinstance(on, os.PathLike) else on
-    if isinstance(on, str) and on in suites.SUITES:
+    frozen = _suite_named(on)
+    if frozen:
         return _compare_on_suite(
-            entrants, on, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
+            entrants, frozen, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
-    about = "\n".join([about or label or scenarios.about(scenario), *doubts(scenario)])
+    about = "\n".join([about or label or registered.about(scenario), *doubts(scenario)])
     words: dict[str, Any] = {"label": label, "about": about}
     play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
     if out is None:
@@ -171,17 +173,56 @@ def compare(
     return comparison
 
 
+def _suite_named(on: Any) -> str:
+    """The name of the suite that ``on`` is or names; empty for a scenario."""
+    if isinstance(on, suites.Suite):
+        return suites.add(on).name if on.own else on.name
+    if isinstance(on, str) and on in suites.SUITES:
+        return on
+    is_own = isinstance(on, str) and is_named(on) and isinstance(find(on), suites.Suite)
+    return suites.named(on) if is_own else ""
+
+
+def suite(
+    name: str, scenarios: Any, *, capacity: int | Sequence[int] = 8, seeds: int = 10, about: str = ""
+) -> suites.Suite:
+    """A suite of your own: scenarios frozen by seeds, for ``compare``, ``bufgym bench --suite module:NAME`` and a board.
+
+    Its splits train, validation and test have the same scenarios and other seeds, so no episode is in two of them. The
+    suite is known by its name from then on, as in ``gym.make("bufgym/Suite-v0", suite="lab-v1", split="train")``.
+
+        lab = bufgym.suite("lab-v1", {"slow": "lte:rate_hz=10", "fast": "lte:rate_hz=30"}, capacity=[8, 16], seeds=20)
+        print(bufgym.compare(["afr", "target-gap"], lab))
+
+    Args:
+        name: its name with a version, such as "lab-v1": a changed suite gets the next one.
+        scenarios: a scenario or its name, or several of one kind by label.
+        capacity: L, messages, or several.
+        seeds: episodes on each trace, 1 to 300.
+        about: a line about it.
+
+    Raises:
+        BufgymError: an argument is out of its range, or scenarios are of different kinds.
+    """
+    many = scenarios if isinstance(scenarios, Mapping) else {name: scenarios}
+    kinds = {tasks.task_for(registered.get(spec)).kind for spec in many.values()}
+    if len(kinds) > 1:
+        raise BufgymError(f"suite {name}: scenarios of {' and '.join(sorted(kinds))}: must be of one kind")
+    kind = kinds.pop() if kinds else "queue"
+    return suites.add(own_suite(name, scenarios, capacity=capacity, seeds=seeds, about=about, kind=kind))
+
+
 def _scenario(on: Any, settings: dict[str, Any]) -> Any:
     """The scenario that ``on`` is or names; ``settings`` are parameters of one that is named."""
     named = isinstance(on, str)
-    if named and not (on.partition(":")[0] in scenarios.SCENARIOS or on.endswith(".toml") or is_named(on)):
-        raise unknown("scenario or suite", on, [*scenarios.SCENARIOS, *suites.SUITES])
-    scenario = scenarios.get(on) if named else on
+    if named and not (on.partition(":")[0] in registered.SCENARIOS or on.endswith(".toml") or is_named(on)):
+        raise unknown("scenario or suite", on, [*registered.SCENARIOS, *suites.SUITES])
+    scenario = registered.get(on) if named else on
     known = parameters(scenario) if named else []
     for name in settings:
         if name not in known:
             raise unknown("keyword", name, [*KEYWORDS, *OF_A_QUEUE, *OF_A_SUITE, *known], place="compare")
-    return scenarios.get(scenario, **settings) if settings else scenario
+    return registered.get(scenario, **settings) if settings else scenario
 
 
 def _compare_on_scenario(

@@ -56,8 +56,9 @@ class Entry:
 
     @property
     def command(self) -> str:
-        needs = " --data DIR" if suites.get(self.suite).needs else ""
-        return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
+        suite = suites.get(self.suite)
+        needs = " --data DIR" if suite.needs else ""
+        return f"bufgym bench --suite {suite.source or suite.name} --policies {self.policy}{needs}"
 
 
 def made_of(spec: str) -> str:

@@ -33,6 +33,7 @@ from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
 from bufgym.scenario.registry import with_parameters
 from bufgym.scenario.suites import Setting
+from bufgym.scenario.suites.own import MOST_SEEDS, fingerprint
 from bufgym.utils import __version__, modules
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked, write_text
@@ -60,9 +61,17 @@ class Sweep:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
+    own: suites.Suite | None = None
+    """The suite where it is one's own, which other processes do not know by name; ``checked`` fills it in."""
+
+    @property
+    def frozen(self) -> suites.Suite:
+        """The suite."""
+        return self.own or suites.get(self.suite)
+
     @property
     def task(self) -> Task:
-        return tasks.task_of(self.suite)
+        return tasks.TASKS[self.frozen.kind]
 
     def __getstate__(self) -> dict[str, Any]:
         # A policy's functions may be of a module that only its file or source defines, so its name is pickled.
@@ -73,7 +82,7 @@ class Sweep:
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
-        settings = suites.get(self.suite).settings(self.split, self.data)
+        settings = self.frozen.settings(self.split, self.data)
         if not self.changes:
             return settings
         return {
@@ -83,7 +92,7 @@ class Sweep:
 
     def capacities_of(self, setting: Setting) -> tuple[int, ...]:
         """L that a setting is met with: those asked for, or else its own or the suite's."""
-        own = self.capacities in ((), suites.get(self.suite).capacities)
+        own = self.capacities in ((), self.frozen.capacities)
         return setting.capacities if own and setting.capacities else self.capacities
 
     def setting(self, label: str, trace: int) -> Setting:
@@ -93,11 +102,12 @@ class Sweep:
 
     def checked(self) -> Sweep:
         """Fill in all defaults and check everything, so that errors come before any work."""
-        suite, task = suites.get(self.suite), self.task
+        suite, task = self.frozen, self.task
         self.settings()
         seeds = suite.seeds if self.seeds is None else self.seeds
-        if not 1 <= seeds <= SEEDS_PER_TRACE:
-            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {SEEDS_PER_TRACE}")
+        most = MOST_SEEDS if suite.own else SEEDS_PER_TRACE
+        if not 1 <= seeds <= most:
+            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {most}")
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         given, compared = self.policies, dict.fromkeys((task.baseline, task.reference))
@@ -105,8 +115,9 @@ class Sweep:
         specs = (*given, *(policies.get(name) for name in compared if name not in names))
         files = self.sources or sources.loaded(names, self.home)
         complete = replace(
-            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
-        )
+            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds,
+            own=suite if suite.own else None,
+        )  # fmt: skip
         check_distinct(complete.policies)
         for policy in complete.policies:
             task.check(policy)
@@ -117,7 +128,8 @@ class Sweep:
         shards = []
         for label, setting in self.settings().items():
             for trace in range(len(by_trace(setting.scenario))):
-                numbers = [SEEDS_PER_TRACE * trace + s for s in range(self.seeds or 0)]
+                first = SEEDS_PER_TRACE * trace + self.frozen.first_seeds.get(self.split, 0)
+                numbers = [first + s for s in range(self.seeds or 0)]
                 for k in range(0, len(numbers), _SEEDS_PER_SHARD):
                     shards.append(Shard(self, label, trace, tuple(numbers[k : k + _SEEDS_PER_SHARD])))
         return shards
@@ -221,7 +233,7 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    suite, settings = suites.get(sweep.suite), sweep.settings()
+    suite, settings = sweep.frozen, sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
     return {
@@ -247,6 +259,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
                 "value": setting.scenario.value.name,
                 **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
                 **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
+                **({"episodes": fingerprint(setting.scenario)} if suite.own else {}),
             }
             for label, setting in settings.items()
         },

@@ -167,7 +167,9 @@ def _command(
 def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], command: str) -> Experiment:
     from bufgym.benchmark.tasks import task_of
 
-    name = suite.suite or ""
+    from bufgym.scenario import suites
+
+    name = suites.named(suite.suite or "")
     arguments = {name: value for name, value in given(suite).items() if name != "suite"}
     arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "changes": changes, "command": command}
     return Experiment(name, task_of(name), arguments)
@@ -288,7 +290,7 @@ def fleet(
 def _suite_of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
     from bufgym.scenario import suites
 
-    suite = suites.get(options.suite or default)
+    suite = suites.get(suites.named(options.suite or default))
     if suite.kind != kind:
         raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
-    return replace(options, suite=suite.name)
+    return replace(options, suite=suite.source or suite.name)

@@ -41,9 +41,9 @@ def leaderboard(
     """
     from bufgym.benchmark import leaderboard as boards
     from bufgym.benchmark.tasks import task_of
-    from bufgym.scenario.suites import SUITES
+    from bufgym.scenario.suites import SUITES, named
 
-    names = suites or [name for name, suite in SUITES.items() if not suite.needs or data]
+    names = [named(name) for name in suites or ()] or [name for name, suite in SUITES.items() if not suite.needs or data]
     board = boards.make(file, {name: task_of(name).default_policies() for name in names}, data=data, jobs=jobs)
     print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
 
