@@ -13,13 +13,14 @@ from typing import Any
 from bufgym import scenario as registered
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
+from bufgym.benchmark.estimates import estimates
 from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Layout, Row, write_rows
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
-from bufgym.policies import Policy, registry
+from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 from bufgym.scenario.suites.own import own_suite
@@ -46,22 +47,34 @@ class Comparison:
     """The policies that do not compete, with the reasons."""
     layout: Layout  # the columns of ``rows``
     page: Callable[[str], str]  # the page, for the command that it names
-    plain: str  # the table as aligned text
-    markdown: str
-    html: str
+    forms: Mapping[str, str]  # the table by form
+    estimates: list[dict[str, Any]]
+    """Each quantity of each policy, over "all" and by scenario and capacity: ``estimate``, ``low`` and ``high``."""
+
+    @property
+    def plain(self) -> str:
+        """The table as aligned text."""
+        return self.forms["plain"]
 
     def table(self, form: str = "plain") -> str:
-        """Means by policy: ``"plain"`` text or ``"markdown"``."""
-        if form not in ("plain", "markdown"):
-            raise BufgymError(f"form = {form!r}: must be 'plain' or 'markdown'")
-        return self.plain if form == "plain" else self.markdown
+        """Means by policy: ``"plain"`` text, ``"markdown"``, or ``"latex"`` (for the package booktabs)."""
+        if form not in (known := ("plain", "markdown", "latex")):
+            raise BufgymError(f"form = {form!r}: must be one of {', '.join(map(repr, known))}")
+        return self.forms[form]
 
-    def to_pandas(self) -> Any:
-        """``rows`` as a pandas DataFrame; ``scenario`` is the name, or ``about`` where it has none."""
+    def to_pandas(self, what: str = "rows") -> Any:
+        """``"rows"`` or ``"estimates"`` as a pandas DataFrame.
+
+        ``scenario`` in rows is the name, or ``about`` where it has none.
+        """
         try:
             import pandas  # type: ignore[import-untyped,unused-ignore]
         except ImportError:
             raise BufgymError("to_pandas needs pandas: pip install pandas") from None
+        if what not in ("rows", "estimates"):
+            raise BufgymError(f"what = {what!r}: must be 'rows' or 'estimates'")
+        if what == "estimates":
+            return pandas.DataFrame(self.estimates)
         about = self.about.partition("\n")[0]
         return pandas.DataFrame([{**row, "scenario": row["scenario"] or about} for row in self.rows])
 
@@ -97,7 +110,7 @@ class Comparison:
 
     def write_table(self, path: Path) -> Path:
         """Write ``about`` and the table as Markdown to this file; return its path."""
-        return write_text(path, f"{self.about}\n\n{self.markdown}\n")
+        return write_text(path, f"{self.about}\n\n{self.forms['markdown']}\n")
 
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
@@ -105,7 +118,7 @@ class Comparison:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(self.about)}</p>\n{self.html}"
+        return f"<p>{html.escape(self.about)}</p>\n{self.forms['html']}"
 
 
 def compare(
@@ -262,10 +275,10 @@ def _compare_on_scenario(
 
     hidden = "" if task.shows_baseline or players == invited else task.baseline
     rendered = [part.forms() for part in task.tables(played, summary, scenario, unranked, hidden)]
-    forms = ["\n\n".join(texts) for texts in zip(*rendered, strict=True)]
+    forms = {name: "\n\n".join(part[name] for part in rendered) for name in rendered[0]}
     page = partial(report.page_of_rows, task, played, players, unranked, scenario, about)
     rows = [row for row in played if row["policy"] != hidden]
-    return Comparison(rows, about, unranked, task.layout, page, *forms)
+    return Comparison(rows, about, unranked, task.layout, page, forms, estimates(summary))
 
 
 def _compare_on_suite(
@@ -284,24 +297,28 @@ def _compare_on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     players = _with_rival(entrants, rival, tasks.task_of(suite))
-    registered = {*registry.names(), *registry.names(named_only=True)}
-    for policy in players:
-        base = policy.name.partition(":")[0]
-        if base not in registered or registry.get(base).on_arrival is not policy.on_arrival:
-            rule = "register it to run it on a suite, whose processes know it by name"
-            raise BufgymError(f"policy {policy.name}: {rule}")
     of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
     sweep = Sweep(suite, tuple(players), capacities=capacities, seeds=seeds, **of_the_sweep)
-    # Other processes can't know what a user's own code registered in this one.
-    if sweep.policy_file is None and not all(policy.built_in or sources.loaded([policy.name]) for policy in players):
-        how["jobs"] = 1
+    how["jobs"] = _jobs(players, how.get("jobs"), sweep.policy_file)
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(out or Path(scratch, "run"))
         rows = sweeps.run_sweep(sweep, place, **how)
         finished, summary = report.run_of(place, "" if rival is None else rival.name)
-    forms = tables.plain(finished, summary), tables.markdown(finished, summary), tables.html(summary)
+    forms = {"plain": tables.plain(finished, summary), "markdown": tables.markdown(finished, summary)}
+    forms |= {"html": tables.html(summary), "latex": tables.latex(summary)}
     unranked, page = table.unranked_among(players), partial(report.page_of_run, finished)
-    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, *forms)
+    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, forms, estimates(summary))
+
+
+def _jobs(players: Sequence[Policy], asked: int | None, policy_file: str | None) -> int | None:
+    """How many processes: one where others can't know what this one's own code made, in a script or a notebook."""
+    alone = [policy.name for policy in players if not sources.known_elsewhere(policy)]
+    if not alone or policy_file is not None:
+        return asked
+    if asked not in (None, 1):
+        rule = "known to this process alone: jobs = 1, or name it as module:function or by its file"
+        raise BufgymError(f"policy {alone[0]}: {rule}")
+    return 1
 
 
 def _with_rival(entrants: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:

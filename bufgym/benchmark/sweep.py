@@ -253,6 +253,7 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
         "sources": sources.digests(sweep.sources, sweep.home) or None,
+        "made_of": {p.name: sources.made_of(p) for p in sweep.policies if not sources.known_elsewhere(p)} or None,
         "scenarios": {
             label: {
                 "about": setting.about,

@@ -166,7 +166,6 @@ def _command(
 
 def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], command: str) -> Experiment:
     from bufgym.benchmark.tasks import task_of
-
     from bufgym.scenario import suites
 
     name = suites.named(suite.suite or "")

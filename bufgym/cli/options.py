@@ -92,8 +92,8 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1); --out DIR keeps
-    it, a second call resumes it."""
+    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1), or module:NAME, your own
+    bufgym.suite(...), whose code is run; --out DIR keeps it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None

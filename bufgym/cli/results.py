@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import Whole
+from bufgym.utils import modules
 from bufgym.utils.errors import BufgymError, printable
 
 DEFAULT = "docs/leaderboard.csv"
@@ -34,7 +35,7 @@ def leaderboard(
     """Run suites and write the leaderboard, CSV and Markdown.
 
     Args:
-        suites: Which (default: all that need no recordings).
+        suites: Which, also module:NAME (default: all that need no recordings).
         file: The leaderboard.
         data: Folder of recordings, for suites over real links.
         jobs: Processes side by side (default: one a core).
@@ -43,7 +44,9 @@ def leaderboard(
     from bufgym.benchmark.tasks import task_of
     from bufgym.scenario.suites import SUITES, named
 
-    names = [named(name) for name in suites or ()] or [name for name, suite in SUITES.items() if not suite.needs or data]
+    names = [named(name) for name in suites or ()] or [
+        name for name, suite in SUITES.items() if not suite.needs or data
+    ]
     board = boards.make(file, {name: task_of(name).default_policies() for name in names}, data=data, jobs=jobs)
     print(f"{len(board)} rows in {file}, as Markdown in {file.with_suffix('.md')}")
 
@@ -52,16 +55,20 @@ def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None
     """Run one row of the leaderboard again and compare.
 
     Args:
-        row: SUITE/POLICY.
+        row: SUITE/POLICY; with a suite of your own module:NAME/POLICY.
         file: The leaderboard.
         data: Folder of recordings, for suites over real links.
         jobs: Processes side by side (default: one a core).
     """
     from bufgym.benchmark import leaderboard as boards
+    from bufgym.scenario.suites import named
 
     if not file.exists():
         whose = f"{DEFAULT} is that of bufgym's repository" if file == Path(DEFAULT) else "as --file says"
         raise BufgymError(f"{file}: no such file ({whose}); bufgym leaderboard --file FILE.csv writes one")
+    suite, _, policy = row.partition("/")
+    if modules.is_named(suite):
+        row = f"{named(suite)}/{policy}"
     entry = boards.find(file, row)
     again = boards.validate(entry, data=data, jobs=jobs)
     print(f"{entry.name}: holds")

@@ -27,7 +27,7 @@ from bufgym.model.observe import (
 )
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.weights import MAX_WIDTH
-from bufgym.sb3.networks import array, takes_masks
+from bufgym.sb3.networks import array, fingerprint_of, takes_masks
 from bufgym.utils.errors import BufgymError
 
 _FIRST = CANDIDATE_FIELDS[0].name
@@ -85,6 +85,7 @@ class CandidateDecisions:
 
     def __init__(self, name: str, agent: Any, candidates: int, masked: bool) -> None:
         self.name, self.agent, self.candidates, self.masked = name, agent, candidates, masked
+        self.fingerprint = fingerprint_of(agent)
         self.at_arrivals = int(agent.action_space.n) == candidates + 2
         space = agent.observation_space
         form = "flat" if not isinstance(space, spaces.Dict) else "slots" if "slots" in set(space) else "dict"

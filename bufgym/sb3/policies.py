@@ -19,7 +19,7 @@ from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
 from bufgym.sb3.export import read_policy, refuse_normalized, weights_of
-from bufgym.sb3.networks import SlotScorer, takes_masks
+from bufgym.sb3.networks import SlotScorer, fingerprint_of, takes_masks
 from bufgym.utils.errors import BufgymError
 
 
@@ -74,6 +74,7 @@ class _Decisions:
 
     def __init__(self, name: str, agent: Any, masked: bool) -> None:
         self.name, self.agent, self.masked = name, agent, masked
+        self.fingerprint = fingerprint_of(agent)
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
