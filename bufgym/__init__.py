@@ -21,8 +21,9 @@ from bufgym.utils.packages import absent as _absent
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy, suite
+    from bufgym.benchmark.curves import curves
 
-__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "make_policy", "suite"]
+__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
 
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),
@@ -53,5 +54,7 @@ for _id, _message in _absent(_GROUP, _gym.registry).items():
     _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"message": f"{_id} {_message}"})
 
 __getattr__ = _on_demand(
-    __name__, dict.fromkeys(("Comparison", "compare", "make_policy", "suite"), "benchmark.compare")
+    __name__,
+    dict.fromkeys(("Comparison", "compare", "make_policy", "suite"), "benchmark.compare")
+    | {"curves": "benchmark.curves"},
 )

@@ -113,3 +113,18 @@ def test_the_example_learns_two_iterations() -> None:
     assert len(returns) == 2, done.stdout
     # The sum over two robots of H - 1, where V <= 1 and 90 frames arrive.
     assert all(0 < float(total) < 2 * 90 for total in returns)
+
+
+def test_a_papers_worth_from_one_program(tmp_path: Path) -> None:
+    """Two agents with three seeds beside three rules: a table of ten rows, its numbers, and a figure of two runs."""
+    pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
+    assert len((EXAMPLES / "paper.py").read_text().splitlines()) <= 75
+    words = [sys.executable, str(EXAMPLES / "paper.py"), "--steps", "150", "--episodes", "1", "--out", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    table = (tmp_path / "table.tex").read_text()
+    names = [f"{name}-{seed}" for name in ("ppo", "dqn") for seed in range(3)]
+    assert all(table.count(f"& {name} &") == 1 for name in [*names, r"every\_second", "target-gap", "afr"])
+    assert (tmp_path / "estimates.csv").read_text().startswith("policy,scenario,capacity,quantity,estimate,low,high\n")
+    assert all(f"{name} (3 seeds)" in (tmp_path / "curves.svg").read_text() for name in ("ppo", "dqn"))

@@ -199,7 +199,7 @@ def _suite_named(on: Any) -> str:
 def suite(
     name: str, scenarios: Any, *, capacity: int | Sequence[int] = 8, seeds: int = 10, about: str = ""
 ) -> suites.Suite:
-    """A suite of your own: scenarios frozen by seeds, for ``compare``, ``bufgym bench --suite module:NAME`` and a board.
+    """A suite of your own, scenarios frozen by seeds: for ``compare``, ``bufgym bench --suite module:NAME`` and boards.
 
     Its splits train, validation and test have the same scenarios and other seeds, so no episode is in two of them. The
     suite is known by its name from then on, as in ``gym.make("bufgym/Suite-v0", suite="lab-v1", split="train")``.

@@ -32,6 +32,7 @@ COMMANDS: dict[str, Any] = {
     "report": "bufgym.cli.results:report",
     "leaderboard": "bufgym.cli.results:leaderboard",
     "validate": "bufgym.cli.results:validate",
+    "curves": "bufgym.cli.results:curves",
     "trace": (
         "Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
         {

@@ -11,7 +11,7 @@ from refusal_cases import refused
 from sweep_cases import contents, ended, interrupt
 
 import bufgym
-from bufgym import policies
+from bufgym import cli, policies
 from bufgym.benchmark import leaderboard, run, sweep
 from bufgym.envs import SenderEnv
 from bufgym.scenario import Interruption, get, suites
@@ -81,12 +81,14 @@ def test_a_run_in_processes_is_resumed_and_never_mixed(tmp_path: Path, monkeypat
     monkeypatch.chdir(tmp_path)
     Path("lab.py").write_text(LAB)
     words = ["bench", "--suite", "lab:LAB", "--policies", "afr,drop-oldest", "--format", "csv", "--out", "out"]
+    whole = sweep.run_shard
+
+    def one_then_stop(shard: sweep.Shard) -> list[Any]:
+        return whole(shard) if shard.label == "slow" else interrupt()
+
     with monkeypatch.context() as cut:
-        whole, first = sweep.run_shard, []
-        cut.setattr(
-            sweep, "run_shard", lambda shard: first.append(shard) or (whole(shard) if len(first) < 2 else interrupt())
-        )
-        assert bufgym.cli.main([*words, "--jobs", "1"]) == 130
+        cut.setattr(sweep, "run_shard", one_then_stop)
+        assert cli.main([*words, "--jobs", "1"]) == 130
     assert "the same command resumes it" in capsys.readouterr().err
     assert [file.name for file in Path("out/parts").iterdir()] == ["slow-0-600.csv"]
     code, said, complaint = ended(*words, "--jobs", "2")
