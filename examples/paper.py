@@ -6,8 +6,8 @@ Each agent learns on the suite's training split, and every policy meets the epis
 """
 
 import argparse
-import csv
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -37,11 +37,11 @@ def every_second(buffer, arrival, memory):
     return -1 if arrival.seq % 2 else -2 if len(buffer.slots) < buffer.capacity else 0
 
 
-def train(name: str, seed: int, steps: int, out: Path) -> None:
+def train(agent, steps, out):
+    name, seed = agent
     folder = out / name / f"seed-{seed}"
     if (folder / "model.zip").exists():
         return
-    folder.mkdir(parents=True, exist_ok=True)
     world = {"suite": LAB.name, "split": "train", "reward": REWARD}
     envs = make_vec_env("bufgym/Suite-v0", seed=1000 * seed, monitor_dir=str(folder), **world)
     TRAINERS[name]("MlpPolicy", envs, seed=seed, device="cpu").learn(steps).save(folder / "model.zip")
@@ -51,19 +51,16 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("--steps", type=int, default=50_000, help="of each agent (%(default)s)")
     parser.add_argument("--episodes", type=int, default=20, help="on each link (%(default)s)")
-    parser.add_argument("--out", type=Path, default=Path("runs/paper"), help="(%(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("runs/paper"))
     options = parser.parse_args()
 
     agents = [(name, seed) for name in TRAINERS for seed in range(3)]
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        list(pool.map(train, *zip(*agents), [options.steps] * 6, [options.out] * 6))
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:  # two cores
+        list(pool.map(partial(train, steps=options.steps, out=options.out), agents))
     models = [as_policy(options.out / n / f"seed-{s}" / "model.zip", f"{n}-{s}") for n, s in agents]
     rules = [every_second, "target-gap", "afr"]
     done = bufgym.compare([*models, *rules], LAB, seeds=options.episodes, out=options.out / "test")
     print(done)
     (options.out / "table.tex").write_text(done.table("latex"))
-    with (options.out / "estimates.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, done.estimates[0])
-        writer.writeheader()
-        writer.writerows(done.estimates)
+    done.write_estimates(options.out / "estimates.csv")
     bufgym.curves([options.out / name for name in TRAINERS], options.out / "curves.svg")

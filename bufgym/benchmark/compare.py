@@ -13,7 +13,7 @@ from typing import Any
 from bufgym import scenario as registered
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
-from bufgym.benchmark.estimates import estimates
+from bufgym.benchmark.estimates import ESTIMATE, estimates
 from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Layout, Row, write_rows
 from bufgym.benchmark.run import run
@@ -107,6 +107,10 @@ class Comparison:
     def write_rows(self, path: str | Path) -> Path:
         """Write the rows to this ``.csv`` or ``.parquet`` file; return its path."""
         return write_rows(self.rows, path, self.layout)
+
+    def write_estimates(self, path: str | Path) -> Path:
+        """Write the estimates to this ``.csv`` or ``.parquet`` file; return its path."""
+        return write_rows(self.estimates, path, ESTIMATE)
 
     def write_table(self, path: Path) -> Path:
         """Write ``about`` and the table as Markdown to this file; return its path."""

@@ -3,9 +3,15 @@
 from typing import Any
 
 from bufgym.benchmark.bootstrap import Interval
+from bufgym.benchmark.rows import Layout
 from bufgym.benchmark.score import CellScore
 from bufgym.benchmark.summary import Summary
 
+ESTIMATE: Layout = {
+    **{"policy": str, "scenario": str, "capacity": int, "quantity": str},
+    **{"estimate": float, "low": float, "high": float},
+}
+"""Columns of the entries; the capacity of "all" is missing."""
 CELL = ("qoi", "score", "regret", "difference")
 """Quantities that a ``CellScore`` has."""
 EVERYWHERE = ("all", None)  # Scenario and capacity of what is over all cells
