@@ -45,6 +45,7 @@ def train(agent, steps, out):
     world = {"suite": LAB.name, "split": "train", "reward": REWARD}
     envs = make_vec_env("bufgym/Suite-v0", seed=1000 * seed, monitor_dir=str(folder), **world)
     TRAINERS[name]("MlpPolicy", envs, seed=seed, device="cpu").learn(steps).save(folder / "model.zip")
+    envs.close()
 
 
 if __name__ == "__main__":
