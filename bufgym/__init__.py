@@ -20,8 +20,9 @@ from bufgym.utils.packages import ENVIRONMENTS as _GROUP
 from bufgym.utils.packages import absent as _absent
 
 if TYPE_CHECKING:
-    from bufgym.benchmark.compare import Comparison, compare, make_policy, suite
+    from bufgym.benchmark.compare import Comparison, compare, make_policy
     from bufgym.benchmark.curves import curves
+    from bufgym.benchmark.own_suite import suite
 
 __all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
 
@@ -55,6 +56,6 @@ for _id, _message in _absent(_GROUP, _gym.registry).items():
 
 __getattr__ = _on_demand(
     __name__,
-    dict.fromkeys(("Comparison", "compare", "make_policy", "suite"), "benchmark.compare")
-    | {"curves": "benchmark.curves"},
+    dict.fromkeys(("Comparison", "compare", "make_policy"), "benchmark.compare")
+    | {"curves": "benchmark.curves", "suite": "benchmark.own_suite"},
 )

@@ -14,25 +14,26 @@ from bufgym import scenario as registered
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
 from bufgym.benchmark.estimates import ESTIMATE, estimates
+from bufgym.benchmark.own_suite import suite_named
+from bufgym.benchmark.parts import run_parts
 from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Layout, Row, write_rows
-from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
 from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
-from bufgym.scenario.suites.own import own_suite
 from bufgym.scenario.texts import doubts
 from bufgym.utils.errors import BufgymError, unknown
 from bufgym.utils.files import write_text
 from bufgym.utils.libraries import library
-from bufgym.utils.modules import find, is_named
+from bufgym.utils.modules import is_named
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "label", "against", "out", "form")
 OF_A_QUEUE = ("max_bytes", "decide_at", "bound")
-OF_A_SUITE = ("split", "data", "changes", "policy_file", "jobs", "backend", "address", "command")
+OF_PROCESSES = ("jobs", "backend", "address", "policy_file")
+OF_A_SUITE = ("split", "data", "changes", "command", *OF_PROCESSES)
 
 
 @dataclass(frozen=True, repr=False)
@@ -154,9 +155,10 @@ def compare(
             (of QoI over Robofleet's with topics, of the gain over AFR with a fleet). It and AFR run too.
         out: a folder that keeps the rows and the table; a suite's run in it is resumed, any other begins an empty one.
         form: format of the rows in ``out``, "parquet" or "csv"; by default parquet if pyarrow is installed.
-        settings: of a queue, ``max_bytes``, ``decide_at`` and ``bound`` (False leaves out the clairvoyant and all that
-            is measured against it). Of a suite, settings of ``Sweep`` and ``run_sweep``: ``split``, ``data``,
-            ``changes``, ``policy_file``, ``jobs``, ``backend``, ``address`` and ``command``. The others are parameters
+        settings: of processes, ``jobs`` (side by side, -1 for one a core; by default one, a suite's one a core),
+            ``backend``, ``address`` and ``policy_file``, as of ``run_sweep``. Of a queue, ``max_bytes``, ``decide_at``
+            and ``bound`` (False leaves out the clairvoyant and all that is measured against it). Of a suite, settings
+            of ``Sweep`` and ``run_sweep``: ``split``, ``data``, ``changes`` and ``command``. The others are parameters
             of a scenario that is named.
 
     Raises:
@@ -169,15 +171,16 @@ def compare(
         raise BufgymError("policies = []: need at least one")
     capacities = (capacity,) if isinstance(capacity, int) else tuple(capacity or ())
     on = os.fspath(on) if isinstance(on, os.PathLike) else on
-    frozen = _suite_named(on)
+    frozen = suite_named(on)
     if frozen:
         return _compare_on_suite(
             entrants, frozen, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
+    processes = {name: settings.pop(name) for name in OF_PROCESSES if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
     about = "\n".join([about or label or registered.about(scenario), *doubts(scenario)])
-    words: dict[str, Any] = {"label": label, "about": about}
+    words: dict[str, Any] = {"label": label, "about": about, "processes": processes}
     play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
     if out is None:
         return play(**words, **of_a_queue)
@@ -188,45 +191,6 @@ def compare(
         comparison.write_rows(place / f"rows.{form or folder.form_of_rows(place)}")
         comparison.write_table(place / "table.md")
     return comparison
-
-
-def _suite_named(on: Any) -> str:
-    """The name of the suite that ``on`` is or names; empty for a scenario."""
-    if isinstance(on, suites.Suite):
-        return suites.add(on).name if on.own else on.name
-    if isinstance(on, str) and on in suites.SUITES:
-        return on
-    is_own = isinstance(on, str) and is_named(on) and isinstance(find(on), suites.Suite)
-    return suites.named(on) if is_own else ""
-
-
-def suite(
-    name: str, scenarios: Any, *, capacity: int | Sequence[int] = 8, seeds: int = 10, about: str = ""
-) -> suites.Suite:
-    """A suite of your own, scenarios frozen by seeds: for ``compare``, ``bufgym bench --suite module:NAME`` and boards.
-
-    Its splits train, validation and test have the same scenarios and other seeds, so no episode is in two of them. The
-    suite is known by its name from then on, as in ``gym.make("bufgym/Suite-v0", suite="lab-v1", split="train")``.
-
-        lab = bufgym.suite("lab-v1", {"slow": "lte:rate_hz=10", "fast": "lte:rate_hz=30"}, capacity=[8, 16], seeds=20)
-        print(bufgym.compare(["afr", "target-gap"], lab))
-
-    Args:
-        name: its name with a version, such as "lab-v1": a changed suite gets the next one.
-        scenarios: a scenario or its name, or several of one kind by label.
-        capacity: L, messages, or several.
-        seeds: episodes on each trace, 1 to 300.
-        about: a line about it.
-
-    Raises:
-        BufgymError: an argument is out of its range, or scenarios are of different kinds.
-    """
-    many = scenarios if isinstance(scenarios, Mapping) else {name: scenarios}
-    kinds = {tasks.task_for(registered.get(spec)).kind for spec in many.values()}
-    if len(kinds) > 1:
-        raise BufgymError(f"suite {name}: scenarios of {' and '.join(sorted(kinds))}: must be of one kind")
-    kind = kinds.pop() if kinds else "queue"
-    return suites.add(own_suite(name, scenarios, capacity=capacity, seeds=seeds, about=about, kind=kind))
 
 
 def _scenario(on: Any, settings: dict[str, Any]) -> Any:
@@ -252,6 +216,7 @@ def _compare_on_scenario(
     label: str,
     about: str,
     progress: bool,
+    processes: dict[str, Any],
     **of_a_queue: Any,
 ) -> Comparison:
     """Run the policies, summarise their rows, and render the summary."""
@@ -259,14 +224,15 @@ def _compare_on_scenario(
     invited = _with_rival(entrants, rival, task)
     players = _with_missing(invited, [make_policy(task.baseline)])
     seeds = task.seeds if seeds is None else seeds
-    how = {"label": label, "progress": progress, **of_a_queue}
-    played = run(players, scenario, capacities or (task.capacity,), seeds, **how)
+    processes["jobs"] = _jobs(players, processes.get("jobs"), processes.get("policy_file"))
+    how: dict[str, Any] = {"label": label, "progress": progress, **processes, **of_a_queue}
+    played = run_parts(players, scenario, capacities or (task.capacity,), seeds, **how)
     holes = [hole for trace in getattr(scenario, "traces", ()) for hole in trace.holes]
     if holes and task.kind == "queue":
         zero = not any(trace.rate_bytes_per_s([start for start, _ in trace.holes]).any() for trace in scenario.traces)
         used, other = ("zero", "hold") if zero else ("hold", "zero")
         filled = replace(scenario, traces=tuple(trace.with_holes(other) for trace in scenario.traces))
-        again = run(players, filled, capacities or (task.capacity,), seeds, **how)
+        again = run_parts(players, filled, capacities or (task.capacity,), seeds, **how)
         others = {(entry["policy"], entry["capacity"]): entry["qoi"] for entry in table.means(again)}
         both = ", ".join(
             f"{entry['policy']} {entry['qoi']:.3f} or {others[entry['policy'], entry['capacity']]:.3f}"

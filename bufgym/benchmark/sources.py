@@ -103,6 +103,14 @@ def made_of(spec: str | Policy) -> str:
     return f"{sys.implementation.cache_tag}-{digest[:12]}"
 
 
+def prepare(policy_file: str | None, sources: Iterable[str], home: str) -> None:
+    """Make policies of this file and these sources known in another process, once."""
+    if policy_file is not None and policy_file not in modules.FILES:
+        modules.run_file(policy_file, "--policy-file")
+    for source in sources:
+        load(source, home)
+
+
 def known_elsewhere(policy: Policy) -> bool:
     """Whether other processes make the same policy of its name: a built-in one, or one that ``load`` has loaded."""
     if not (policy.built_in or loaded([policy.name])):

@@ -23,7 +23,6 @@ from typing import Any
 
 from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
-from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import check_distinct, run
 from bufgym.benchmark.table import unranked_among
@@ -155,10 +154,7 @@ _TRIES = 3  # worker deaths in a row, without a finished shard between them, tha
 def run_shard(shard: Shard) -> list[Row]:
     """Run one shard and return its rows. Each process runs the sweep's policy file once."""
     sweep = shard.sweep
-    if sweep.policy_file is not None and sweep.policy_file not in modules.FILES:
-        modules.run_file(sweep.policy_file, "--policy-file")
-    for source in sweep.sources:
-        sources.load(source, sweep.home)
+    sources.prepare(sweep.policy_file, sweep.sources, sweep.home)
     setting = sweep.setting(shard.label, shard.trace)
     limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
     return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
@@ -200,10 +196,7 @@ def run_sweep(
     sweep = sweep.checked()
     if jobs is None:
         jobs = -1 if backend != "loky" or importlib.util.find_spec("joblib") else 1
-    if jobs < -1 or jobs == 0:
-        raise BufgymError(f"jobs = {jobs}: must be a whole number >= 1, or -1 for one a core")
-    if backend not in BACKENDS:
-        raise BufgymError(f"backend = {backend!r}: must be one of {', '.join(BACKENDS)}")
+    cluster.check(jobs, backend)
     layout = sweep.task.layout
     form = form or folder.form_of_rows(out)
     whole, parts = out / f"rows.{form}", out / "parts"

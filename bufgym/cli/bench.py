@@ -98,7 +98,7 @@ def bench(
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
         experiment = _on_suite(suite, who, given(shared), command)
     else:
-        refuse(given(suite), "needs --suite")
+        refuse(given(suite, "split", "data"), "needs --suite")
         if drops is not None and workload.workload is None:
             raise BufgymError("--drops needs --workload")
         if mcap is not None and (workload.workload is None or mcap.suffix != ".mcap"):
@@ -106,6 +106,8 @@ def bench(
         if mcap is not None and not all(map(is_recording, workload.workload or [])):
             raise BufgymError(f"--mcap {mcap}: needs a recording that holds the messages themselves (MCAP, ROS bag)")
         experiment = _on_scenario(options, buffer, who.seeds)
+        processes = given(suite, "jobs", "backend", "address")
+        experiment.arguments.update(processes, **({"policy_file": who.policy_file} if who.policy_file else {}))
     entrants, rival = who.entrants(experiment.task), who.rival()
     topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
     file, folder, page = out.file(), out.folder(), out.page()

@@ -99,7 +99,7 @@ class SuiteOptions:
     data: str | None = None
     """Folder of recordings, for suites over real links."""
     jobs: Whole | None = None
-    """Processes side by side (default: one a core)."""
+    """Processes side by side, -1 for one a core (default: a suite one a core, any other one)."""
     backend: str | None = None
     """loky (default), threading, sequential, ray or dask."""
     address: str | None = None
