@@ -17,6 +17,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+import bufgym
 from bufgym import cli, policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.policies import weights
@@ -215,3 +216,13 @@ def test_weights_are_those_of_the_model() -> None:
     torch_first, _, torch_last = model.q_net.q_net
     assert np.array_equal(first.T, torch_first.weight.detach()) and np.array_equal(last.T, torch_last.weight.detach())
     assert np.array_equal(bias, torch_first.bias.detach())
+
+
+def test_a_model_in_torch_runs_on_a_suite_and_its_folder_knows_its_numbers(tmp_path: Path) -> None:
+    lab = bufgym.suite("lab-v1", SCENARIO, capacity=3, seeds=1)
+    models = [model_of(PPO, seed=seed, env={"fields": ["rate_short"], "capacity": 3}) for seed in (4, 5)]
+    first, other = (as_policy(model, "mine") for model in models)
+    done = bufgym.compare(first, lab, out=tmp_path / "out", progress=False)
+    again = bufgym.compare(as_policy(models[0], "mine"), lab, out=tmp_path / "out", progress=False)
+    assert repr(again.rows) == repr(done.rows)
+    refuse("made_of is .*never mixed", bufgym.compare, other, lab, out=tmp_path / "out", progress=False)
