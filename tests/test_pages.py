@@ -150,7 +150,7 @@ RUN = {
     r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
     r"bufgym (--help|list \w+|trace fetch --list)": "",
     r"bufgym trace generate .*": "-o made.csv",
-    r"bufgym play --policies .*": "--speed 0 --steps 20",
+    r"bufgym play --policies .*": "--speed 1000 --steps 20",
 }
 """Pattern of a whole command -> the settings behind it that make it short. Others have tests of their own."""
 

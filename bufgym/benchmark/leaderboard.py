@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies
 from bufgym.benchmark import bootstrap, folder, score
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
+from bufgym.benchmark.sources import made_of
 from bufgym.benchmark.summary import places, shown, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import task_of
-from bufgym.jit.fingerprint import fingerprint
-from bufgym.oracle import cached
 from bufgym.scenario import suites
 from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError, where
@@ -57,29 +55,9 @@ class Entry:
 
     @property
     def command(self) -> str:
-        needs = " --data DIR" if suites.get(self.suite).needs else ""
-        return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
-
-
-def made_of(spec: str) -> str:
-    """Hash of what a policy decides by: its functions with all that they call and read, and its settings.
-
-    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare. A
-    policy that is not registered here has none.
-    """
-    try:
-        policy = policies.get(spec)
-    except BufgymError:
-        return ""
-    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send
-    fingerprints = [
-        fingerprint(getattr(function, "py_func", function)) for function in functions if function is not None
-    ]
-    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are cached
-        fingerprints.append(cached.sources())
-    numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
-    digest = hashlib.sha256(repr((fingerprints, numbers)).encode()).hexdigest()
-    return f"{sys.implementation.cache_tag}-{digest[:12]}"
+        suite = suites.get(self.suite)
+        needs = " --data DIR" if suite.needs else ""
+        return f"bufgym bench --suite {suite.source or suite.name} --policies {self.policy}{needs}"
 
 
 STATISTICS = (

@@ -5,11 +5,10 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 
 from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
-from bufgym.model.checks import above_0, whole
+from bufgym.model.checks import above_0, flag, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
@@ -109,8 +108,7 @@ class Options:
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
             raise BufgymError(f"fields = {names!r}: must be a list of names or 'compact'")
-        if not isinstance(self.bound, bool | np.bool_):
-            raise BufgymError(f"bound = {self.bound!r}: must be True or False")
+        flag("bound", self.bound)
         whole("num_threads", self.num_threads, 1)
 
     def window(self) -> "Window | None":

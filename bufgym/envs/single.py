@@ -105,7 +105,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
         super().reset(seed=seed)
         if seed is not None or self.sub_envs.streams[0] is None:
             self.sub_envs.seed(0, self.np_random)
-        options = options or {}
+        options = {} if options is None else options
         check_entries(options, ("episode", *NUMBERED), "options")
         if "episode" in options and len(options) > 1:
             raise BufgymError(f"options: an episode, or its {', '.join(NUMBERED)}; not both")

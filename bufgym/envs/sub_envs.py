@@ -5,7 +5,7 @@
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,8 +49,10 @@ NUMBERED = ("scenario", "trace", "seed")
 """Options that name an episode of a benchmark; see ``bufgym.scenario.numbered``."""
 
 
-def check_entries(names: Iterable[str], known: Sequence[str], place: str) -> None:
-    """Check that all ``names`` of entries are ``known``; errors call what has them ``place``."""
+def check_entries(names: Mapping[str, Any], known: Sequence[str], place: str) -> None:
+    """Check that ``names`` is a dict of ``known`` entries alone; errors call it ``place``."""
+    if not isinstance(names, Mapping):
+        raise BufgymError(f"{place} = {names!r}: must be a dict of {', '.join(known)}")
     for name in names:
         if name not in known:
             raise unknown("entry", name, known, place=place)
