@@ -1,6 +1,7 @@
 """Leaderboard: results of each policy on each suite, with the command that repeats and checks them."""
 
 import hashlib
+import hashlib
 import io
 import math
 import re
