@@ -1,8 +1,8 @@
 """Laws of message sizes, as text: how the bytes of the messages of one stream vary.
 
-docs/guide/unequal-sizes.md lists them. `jpeg:cv=0.3,rho=0.9` changes parameters: `rho` from one frame to the next and
-`cv` of the slow part, `noise`, the coefficient of variation of the part drawn anew, and a law's own. Each law has the
-asked mean in expectation: it is divided by its own mean, not by the drawn sequence's.
+docs/guide/topics-and-sizes.md lists them. `jpeg:cv=0.3,rho=0.9` changes parameters: `rho` from one frame to the next
+and `cv` of the slow part, `noise`, the coefficient of variation of the part drawn anew, and a law's own. Each law has
+the asked mean in expectation: it is divided by its own mean, not by the drawn sequence's.
 """
 
 import functools
