@@ -34,7 +34,7 @@ def name_stale() -> int:
 
 def name_stale_pages() -> int:
     """Name each page whose intervals were made by other statistics than today's."""
-    pages = {page: page.read_text(encoding="utf-8") for page in sorted(Path("docs").rglob("*.md"))}
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(Path("results").glob("*.md"))}
     stale = leaderboard.stale_pages(pages)
     for page in stale:
         print(f"{page}: statistics have changed since; run the page's commands again, then leaderboard.py stamp {page}")

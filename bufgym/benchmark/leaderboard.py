@@ -1,7 +1,6 @@
 """Leaderboard: results of each policy on each suite, with the command that repeats and checks them."""
 
 import hashlib
-import hashlib
 import io
 import math
 import re
@@ -20,6 +19,7 @@ from bufgym.benchmark.summary import places, shown, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import task_of
+from bufgym.jit.fingerprint import fingerprint
 from bufgym.scenario import suites
 from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError, where
