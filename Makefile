@@ -32,7 +32,7 @@ help:
 	@echo "make tutorials    set up if needed, then run the tutorials and draw their pictures again"
 	@echo "make dist     set up if needed, then build and check wheels for Linux (x86_64, aarch64) and sdist in dist/"
 	@echo "make install-matrix    install the wheel for each Python, with the newest and oldest dependencies"
-	@echo "make trainers    set up if needed, then run each program of docs/guide/trainers.md in a fresh environment (LIBRARY=skrl: one)"
+	@echo "make trainers    set up if needed, then run each program of examples/trainers in a fresh environment (LIBRARY=skrl: one)"
 	@echo "make format   set up if needed, then format and fix what can be fixed"
 	@echo "make clean    remove caches and build products; keeps .venv and results"
 	@echo ""
@@ -62,7 +62,7 @@ fuzz: $(READY)
 claims: $(READY)
 	mkdir -p build
 	$(BIN)/python -m bufgym reproduce --claims build/claims.md $(if $(DATA),--data $(DATA))
-	$(BIN)/python .ci/claims.py docs/claims.md build/claims.md
+	$(BIN)/python .ci/claims.py results/claims.md build/claims.md
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict

@@ -1,4 +1,4 @@
-"""Which claims have another verdict now: ``claims.py docs/claims.md build/claims.md``.
+"""Which claims have another verdict now: ``claims.py results/claims.md build/claims.md``.
 
 Times and random draws differ from run to run, so numbers are not compared. A claim that was not checked, as its
 recordings are not here, is left out. Exit status 1 if a verdict changed, or a claim is on one page alone.

@@ -1,8 +1,11 @@
-"""Check docs/leaderboard.csv: ``leaderboard.py stale``, ``sample N`` or ``COMMIT``; 1 if a row does not hold.
+"""Check results/leaderboard.csv: ``leaderboard.py stale``, ``sample N`` or ``COMMIT``; 1 if a row does not hold.
+
+``leaderboard.py pages`` does as much for the pages of results, ``stamp PAGE`` says that a page was made anew.
 
 ``stale`` runs nothing. It names the rows whose policy has changed since they were made. ``sample`` runs N rows that the
 date draws. COMMIT runs each row that differs from that commit's. A row whose suite needs recordings is named and left
-out.
+out. A page states the fingerprint of the statistics by which its intervals and shares were made, as a row states that
+of its policy: ``pages`` names those that were made by other ones.
 """
 
 import random
@@ -15,7 +18,7 @@ from pathlib import Path
 from bufgym.benchmark import leaderboard
 from bufgym.scenario.suites import SUITES
 
-FILE = Path("docs/leaderboard.csv")
+FILE = Path("results/leaderboard.csv")
 
 
 def name_stale() -> int:
@@ -27,6 +30,25 @@ def name_stale() -> int:
     unknown = sum(entry.made_of == leaderboard.UNKNOWN for entry in board.values())
     print(f"{len(board)} rows, {len(stale)} stale, {unknown} do not say what their policy was made of")
     return int(bool(stale))
+
+
+def name_stale_pages() -> int:
+    """Name each page whose intervals were made by other statistics than today's."""
+    pages = {page: page.read_text(encoding="utf-8") for page in sorted(Path("results").glob("*.md"))}
+    stale = leaderboard.stale_pages(pages)
+    for page in stale:
+        print(f"{page}: statistics have changed since; run the page's commands again, then leaderboard.py stamp {page}")
+    made = [leaderboard.statistics_of(text) for text in pages.values()]
+    stated = sum(one not in (None, leaderboard.UNKNOWN) for one in made)
+    unknown = made.count(leaderboard.UNKNOWN)
+    print(f"{stated} pages with intervals, {len(stale)} stale; {unknown} more do not say how they were made")
+    return int(bool(stale))
+
+
+def stamp(page: Path) -> int:
+    """State today's statistics in a page that was just made."""
+    page.write_text(leaderboard.stamped(page.read_text(encoding="utf-8")), encoding="utf-8")
+    return 0
 
 
 def validate(names: Iterable[str]) -> int:
@@ -59,4 +81,6 @@ def main(commit: str) -> int:
 if __name__ == "__main__":
     if sys.argv[1] == "sample":
         sys.exit(sample(int(sys.argv[2])))
+    if sys.argv[1] in ("pages", "stamp"):
+        sys.exit(name_stale_pages() if sys.argv[1] == "pages" else stamp(Path(sys.argv[2])))
     sys.exit(name_stale() if sys.argv[1] == "stale" else main(sys.argv[1]))

@@ -182,6 +182,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
         pytest("all uncompiled", folder, *plain, compiled=False, limit_s=25 * MINUTE),
         pytest("fuzz", folder, "tests/fuzz", *arguments, environment=many, limit_s=15 * MINUTE),
         Stage("claims", [*make, "claims", f"DATA={DATA}"], limit_s=30 * MINUTE, unless=recordings),
+        Stage("pages", [PYTHON, ".ci/leaderboard.py", "pages"]),
         Stage("numbers", [PYTHON, ".ci/leaderboard.py", "sample", "20"], limit_s=30 * MINUTE),
         Stage("speed", [PYTHON, "-m", "studies.perf", "--history", "results/perf.jsonl"], limit_s=5 * MINUTE),
         Stage("mutants", [PYTHON, *sample], limit_s=25 * MINUTE),

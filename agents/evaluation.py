@@ -108,8 +108,8 @@ class EvaluationSet:
         score = float(normalised_score(agent, base, best).mean())
         return Verdict(score, regrets, regrets / afr_regrets if afr_regrets else np.inf)
 
-    def benchmark_rows(self, outcomes: Sequence[Outcome], name: str, training_seed: int) -> list[Row]:
-        """An agent's outcomes as rows of the benchmark, which name the training seed too."""
+    def benchmark_rows(self, outcomes: Sequence[Outcome], name: str, training_seed: int | None) -> list[Row]:
+        """An agent's outcomes as rows of the benchmark, which name the training seed too, if there is one."""
         rows = []
         for key, result in zip(self._keys, outcomes, strict=True):
             fixed = self._fixed[*_name(key), BASELINE]

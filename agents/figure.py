@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bufgym.benchmark.bootstrap import Interval
 
-_LINES = ("tab:gray", "tab:green", "tab:blue")
+_LINES = ("tab:gray", "tab:brown", "tab:green", "tab:olive", "tab:cyan", "tab:blue")
 """Colours of the horizontal lines, in their order."""
 
 

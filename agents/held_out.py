@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from agents.constants import UNTAUGHT
 from agents.evaluation import play
 from agents.mixed_env import Cell
 from agents.settings import Settings
@@ -18,7 +19,7 @@ from agents.tasks import Environment
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, times_drawn
 from bufgym.benchmark.rows import Row
-from bufgym.benchmark.score import scores
+from bufgym.benchmark.score import REFERENCE, CellScore, scores
 from bufgym.benchmark.tasks import QueueTask
 from bufgym.oracle import BASELINE, normalised_score, regret
 from bufgym.policies import Policy, registry
@@ -70,8 +71,9 @@ class FixedEpisodes:
         return play(agent, [Cell("", self.scenario, self.capacity)], [len(self.episodes)], self.episodes)
 
     def play_fixed(self) -> dict[str, list[Outcome]]:
-        """Outcomes of every registered policy of one queue, by name."""
-        return {name: self.play(registry.get(name)) for name in registry.names(for_topics=False)}
+        """Outcomes of constant actions, of chance and of every registered policy of one queue, by name."""
+        fixed = [*UNTAUGHT, *(registry.get(name) for name in registry.names(for_topics=False))]
+        return {policy.name: self.play(policy) for policy in fixed}
 
     def score(self, outcomes: Sequence[Outcome]) -> float:
         """0 for Drop Oldest, 1 for the clairvoyant; NaN where the two are equal."""
@@ -104,6 +106,20 @@ def known_mean(numbers: Sequence[float]) -> float:
     """The mean of the known numbers, NaN if none is: a policy that delivered nothing has no delay."""
     known = [number for number in numbers if not math.isnan(number)]
     return float(np.mean(known)) if known else math.nan
+
+
+def together(rows: Sequence[Row], several: Mapping[str, Sequence[tuple[int, str]]]) -> dict[str, CellScore]:
+    """What the agents of several training seeds score together, by algorithm: for fresh seeds and fresh links.
+
+    ``several`` has each algorithm's (seed, name in the rows).
+    """
+    plain, found = [row for row in rows if row["policy"] in (BASELINE, REFERENCE)], {}
+    for algo, agents in several.items():
+        seed_of = {name: seed for seed, name in agents}
+        own = [{**row, "training_seed": seed_of[row["policy"]]} for row in rows if row["policy"] in seed_of]
+        cells = scores([*plain, *({**row, "policy": algo} for row in own)]).cells
+        found[algo] = next(cell for cell in cells if cell.policy == algo)
+    return found
 
 
 def summarise(outcomes: Mapping[str, Sequence[Outcome]], rows: Sequence[Row], agent: str) -> list[dict[str, Any]]:

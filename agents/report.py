@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from agents.constants import NAMES, UNTAUGHT
 from agents.evaluation import EvaluationSet, sweep_for, test_rows
 from agents.figure import draw
-from agents.held_out import fixed_episodes, summarise
+from agents.held_out import fixed_episodes, summarise, together
 from agents.runs import Run, write_notes
 from agents.settings import Settings
 from bufgym.benchmark import summary
@@ -145,7 +146,7 @@ def report_environment(trained: Trained) -> Report:
     """Evaluate all agents and fixed policies on the held-out episodes."""
     settings, best = trained.settings, agent_name(trained.best)
     test = fixed_episodes(settings, "test")
-    names = {agent_name(run): run for run in trained.runs}
+    names, ways = {agent_name(run): run for run in trained.runs}, (trained, *trained.beside)
     agents = [*trained.agents]
     for way in trained.beside:
         names |= {f"agent by {way.settings.algo} (seed {run.seed})": run for run in way.runs}
@@ -153,14 +154,22 @@ def report_environment(trained: Trained) -> Report:
     outcomes = test.play_fixed() | {name: test.play(agent) for name, agent in zip(names, agents, strict=True)}
     rows = test.rows(outcomes)
     entries, alike = summarise(outcomes, rows, best), with_equal_rows(rows)
+    seeds = {way.settings.algo: [(run.seed, name) for name, run in names.items() if run in way.runs] for way in ways}
+    joined = together(rows, {algo: agents for algo, agents in seeds.items() if len(agents) > 1})
     unranked = unranked_among(map(registry.get, registry.names()))
     traces = [trace.name for trace in getattr(test.scenario, "traces", ())]
     over = "other links of this kind" if traces else "this kind"
     print(table(entries, best, alike, unranked))
     print(f"in brackets: 95 % intervals for other episodes of {over}" + f", from {len(traces)} links" * bool(traces))
+    for algo, cell in joined.items():
+        score, more = _text(cell.score, ".3f"), _text(cell.difference, "+.3f")
+        print(f"{len(seeds[algo])} seeds of {algo} together: score {score}, QoI - AFR's {more}, for other seeds, too")
+    for remark in scores(rows).remarks:
+        print(remark)
     print(verdict(entries, best, trained.best.seconds, trained.settings.algo, over))
     held_out = {"episodes": len(test.episodes), "traces": traces}
-    notes = trained.save(trained.folder, held_out=held_out, scores=entries)
+    of_seeds = {algo: dataclasses.asdict(cell) for algo, cell in joined.items()}
+    notes = trained.save(trained.folder, held_out=held_out, scores=entries, together=of_seeds)
     bars = {e["policy"]: Interval(e["score"], *e["score_95"]) for e in entries if e["policy"] not in unranked}
     bars, equals = _drawn(bars, alike)
     draw(
@@ -176,15 +185,19 @@ def report_environment(trained: Trained) -> Report:
 
 
 def verdict(entries: Sequence[dict[str, Any]], agent: str, seconds: float, algo: str, over: str) -> str:
-    """One sentence: the distance of the agent's score from AFR, the best rules and other agents, on episodes of what.
+    """One sentence: the distance of the agent's score from rules and other agents, on episodes of what.
+
+    First comes the better of the constant actions: what is not above it has learned nothing that shows.
 
     It is level with a policy where the 95 % interval of the difference in QoI has 0 in it.
     """
     known, rules = {entry["policy"]: entry for entry in entries}, by_hand()
     best = next(name for name in known if name in rules)  # the best first, as all entries are
+    constant = next((name for name in known if name in NAMES[:-1]), "")
     others = [name for name in known if name.startswith("agent by ")]
     first = {name.partition(" (")[0]: name for name in reversed(others)}.values()  # the best seed of each algorithm
     rivals = {
+        constant: f"the better constant action, {constant},",
         "afr": "AFR",
         best: f"the best rule written by hand, {best},",
         "target-gap": "target-gap",
@@ -271,7 +284,10 @@ def report_suite(trained: Trained, suite: str, home: Path) -> tuple[dict[str, An
         agent_name(run): evaluation.benchmark_rows(evaluation.play(agent), f"agent ({settings.algo})", run.seed)
         for run, agent in zip(runs, trained.agents, strict=True)
     }
-    rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows]
+    fixed = [evaluation.benchmark_rows(evaluation.play(policy), policy.name, None) for policy in UNTAUGHT]
+    rows: list[Row] = [{**row, "training_seed": None} for row in evaluation.rows] + [
+        row for own in fixed for row in own
+    ]
     rows += [row for own in agents.values() for row in own]
     write_rows(rows, home / "rows.csv")
     result = scores(rows, unranked_among(map(registry.get, registry.names())))
@@ -309,7 +325,7 @@ def standings(result: Scores) -> str:
         lines.append([name, score, regret, iqm, _text(standing["improvement"], ".2f")])
     total = len({(cell.scenario, cell.capacity) for cell in result.cells})
     note = f"{result.counted} of {total} cells (scenario, L) count; score: 0 is {BASELINE}, 1 the clairvoyant"
-    return "\n".join([*aligned(lines), note])
+    return "\n".join([*aligned(lines), note, *result.remarks])
 
 
 def _text(interval: Interval, form: str) -> str:

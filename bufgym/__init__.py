@@ -21,8 +21,10 @@ from bufgym.utils.packages import absent as _absent
 
 if TYPE_CHECKING:
     from bufgym.benchmark.compare import Comparison, compare, make_policy
+    from bufgym.benchmark.curves import curves
+    from bufgym.benchmark.own_suite import suite
 
-__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "make_policy"]
+__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
 
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),
@@ -53,5 +55,7 @@ for _id, _message in _absent(_GROUP, _gym.registry).items():
     _gym.register(_id, _stand_in, vector_entry_point=_stand_in, kwargs={"message": f"{_id} {_message}"})
 
 __getattr__ = _on_demand(
-    __name__, {"Comparison": "benchmark.compare", "compare": "benchmark.compare", "make_policy": "benchmark.compare"}
+    __name__,
+    dict.fromkeys(("Comparison", "compare", "make_policy"), "benchmark.compare")
+    | {"curves": "benchmark.curves", "suite": "benchmark.own_suite"},
 )

@@ -1,6 +1,6 @@
 """Eq. 3-6 of the AFR paper tested on views of real frames: do the assumptions on V hold, and does it matter?
 
-See docs/methods.md, "The assumptions on V, on real frames".
+See packages/papers/PERCEPTION.md, "What a frame shows: overlap and coverage".
 """
 
 from __future__ import annotations

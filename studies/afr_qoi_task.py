@@ -167,4 +167,4 @@ def spearman_over(a: NDArray[np.float64], b: NDArray[np.float64], group: NDArray
     for _ in range(RESAMPLES):
         drawn = np.concatenate([members[k] for k in rng.integers(0, len(members), len(members))])
         numbers.append(spearman(a[drawn], b[drawn]))
-    return interval(np.array(numbers), len(members))
+    return interval(np.array(numbers), len(members), within=(-1, 1))

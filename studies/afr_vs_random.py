@@ -1,6 +1,6 @@
 """AFR against Random's expectation over every concave V, a claim that the AFR paper does not prove.
 
-See docs/methods.md, "AFR against Random over every concave V".
+See packages/papers/bufgym_papers/figures/README.md, "AFR against Random over every concave V".
 """
 
 from __future__ import annotations

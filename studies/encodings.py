@@ -1,6 +1,16 @@
 """Bytes of a ROS message in ROS 1, ROS 2, Robofleet's flatbuffer and rosbridge's JSON.
 
-See docs/methods.md, "Bytes of a message in four encodings".
+    ros1            ROS 1 binary
+    cdr             ROS 2 CDR, encapsulation header included
+    robofleet       Robofleet's flatbuffer as its client sends it: the message's type and topic inside
+    robofleet-bare  the same without type and topic
+    json            rosbridge's publish operation as rosbridge_suite writes it: spaces after , and :, uint8[] in base64
+    json-numbers    the same as JSON.stringify writes it: no spaces, uint8[] as a list of numbers, 0.0 as 0
+
+Robofleet makes its schema from ROS 1 definitions with msg2fbs in github.com/ut-amrl/robofleet. Each message, nested or
+not, is a table with its metadata in slot 0 and then its fields in order. Time is a struct of two uint32, every array a
+vector, and `flatc` writes the larger fields of a table first. We derive the tables from the same definitions, which
+come with `rosbags`, and write them with `flatbuffers`: the extra `robofleet` of `packages/live` installs both.
 """
 
 from __future__ import annotations

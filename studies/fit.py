@@ -42,24 +42,10 @@ Made by `{command}`; do not edit.
 The generator is `bufgym/traces/generate/markov.py`. Its parameters are in `{file}` beside it, and
 `bufgym/traces/fit.py` fits them.
 
-How to read the tables:
-
-- A *set* has as many generated traces as the mode has recordings. Each trace is as long as its counterpart.
-- *Generated* is the median of {sets} sets. *95 % of sets* is the range of their middle 95 %.
-- *p* is twice the smaller share of sets at or beyond the recordings' value. This is a Monte Carlo test. Generated
-  traces have their own correlation in time, so seconds need not be independent.
-- Rows with p < {level} are in bold. There the model does not match.
-
-With so many rows, one in twenty is expected to be bold by chance. The parameters were fitted to these very recordings,
-so a p near 1 means less than it seems. With few recordings the sets scatter widely, and much would pass. The last
-column of the first table shows how much the test can detect. It counts the rows that links of independent seconds do
-not match. These links have the same distribution of rates and no outages.
-
-*Held out* is the honest test of the distribution. It compares a recording with links fitted to the other recordings of
-its mode. The *Kolmogorov-Smirnov distance* is the greatest distance between two cumulative distributions.
-
-Each mode begins with its parameters. The variance of the rates' normal scores has three parts. *Place* stays the same
-for a whole trace, *level* stays the same for a while, and *fast* changes every second.
+Medians and ranges are over {sets} sets; rows with p < {level} are in bold.
+[How to read the tables](../docs/methods.md#how-links-are-fitted-to-recordings). Each mode begins with its parameters:
+the shares of the variance of the rates' normal scores that stay for a whole trace (*place*), for a while (*level*), and
+for a second (*fast*).
 """
 
 

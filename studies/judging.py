@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agents.evaluation import Numbers
 from agents.families import Family, Run
 from bufgym import policies
-from bufgym.benchmark.bootstrap import RESAMPLES, SEED, Interval, interval, stream, times_drawn
+from bufgym.benchmark.bootstrap import NOT_NEGATIVE, RESAMPLES, SEED, Interval, interval, stream, times_drawn
 from bufgym.policies import Policy
 from studies import families
 from studies.causal_planner import LAWS, NAME, Planning, qoi_of
@@ -43,7 +43,7 @@ class Row:
 
     def share(self, policy: str) -> Interval:
         """A policy's share."""
-        return interval(self.shares[policy], self.links)
+        return interval(self.shares[policy], self.links, within=NOT_NEGATIVE)
 
     def above(self, policy: str, other: str) -> Interval:
         """How far a policy's share lies above another's."""

@@ -2,7 +2,7 @@
 
     python -m studies.learned --data DIR
     python -m studies.learned runs/new/learned.safetensors --against agents/pretrained/learned.safetensors --data DIR
-    python -m studies.learned --data DIR --planner --out docs/agents.md
+    python -m studies.learned --data DIR --planner --out results/agents.md
 
 Without a file it judges the agent that ships. ``--against`` names another agent of any kind, with which the first is
 compared in pairs. ``--planner`` adds the hindsight planner. ``--only task,lte`` judges on these families alone, and
@@ -51,7 +51,7 @@ the rule `gap-price`. It was made by `{made}`{seed}.
   places, messages in bursts or of unequal bytes, and a V that saturates.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
 - *Falls short* of a rule, on a row below, by an interval without zero: {short}.
-- *Trained* on {families} families of links and streams at once. [Training](guide/training.md) says how.
+- *Trained* on {families} families of links and streams at once. [Training](../docs/guide/training.md) says how.
 
 """
 TEST = """```
@@ -81,7 +81,7 @@ Parts of rows:
 """
 PLANNER = """
 The hindsight planner (`studies/causal_planner.py`) on some of these runs. It knows the law of links and motion, and
-`learned` does not; it is slow, and [the truth](guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
+`learned` does not. It is slow: [truth](../docs/guide/truth.md#what-an-agent-without-the-future-can-reach) says more.
 
 {shares}
 
@@ -182,7 +182,7 @@ def main(
         only: families to judge on, such as task,lte; by default all but unequal, whose bounds take minutes.
         planner: whether the hindsight planner plays as well, on some runs of task and lte.
         folder: where bounds and the planner's runs are kept.
-        out: a Markdown file for the page of the agent that ships, such as docs/agents.md.
+        out: a Markdown file for the page of the agent that ships, such as results/agents.md.
     """
     chosen, makers = files or (SHIPPED,), families.chosen(data, only)
     network, notes = weights.read(chosen[0]) if out else (None, {})

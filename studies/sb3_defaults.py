@@ -1,4 +1,4 @@
-"""How far the trainers of stable-baselines3 come by their own defaults: the curves of docs/guide/trainers.md.
+"""How far the trainers of stable-baselines3 come by their own defaults: the curves of results/trainers.md.
 
 python -m studies.sb3_defaults --trainers PPO DQN A2C MaskablePPO --reward regret --steps 200000
 python -m studies.sb3_defaults --reward paired --repeat 3 --rows 8 --seeds 0 1 2 3 4 5 6 7 8 9 --steps 300000
@@ -17,7 +17,7 @@ import csv
 import io
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -30,8 +30,10 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
+from agents.constants import UNTAUGHT
 from bufgym import policies
 from bufgym import scenario as scenarios
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, stream, times_drawn
 from bufgym.benchmark.tasks import QueueTask
 from bufgym.oracle import BASELINE, normalised_score
 from bufgym.sb3 import make_vec_env, takes_masks
@@ -39,10 +41,11 @@ from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome
 from bufgym.utils.files import write_text
-from studies.page import command, table
+from studies.page import command, table, written
 
 TRAINERS: dict[str, Any] = {"PPO": PPO, "DQN": DQN, "A2C": A2C, "MaskablePPO": MaskablePPO}
-RULES = ("afr", "target-gap", "gap-price")
+RULES = {name: policies.get(name) for name in ("afr", "target-gap", "gap-price")}
+RULES |= {policy.name: policy for policy in UNTAUGHT}
 FIRST_SEED = 2_000_000_000  # of the episodes for evaluation
 ROLLOUT = 16_384  # most steps between two updates of any trainer
 Trainer = Literal["PPO", "DQN", "A2C", "MaskablePPO"]
@@ -125,12 +128,12 @@ class Episodes:
             over |= ended
         return self._score(math.fsum(qoi))
 
-    def of_rule(self, name: str) -> float:
-        """The score of a registered policy."""
-        return self._score(self._qoi_of_rule(name))
+    def of_rule(self, rule: str | policies.Policy) -> float:
+        """The score of a registered policy, or of another one."""
+        return self._score(self._qoi_of_rule(rule))
 
-    def _qoi_of_rule(self, name: str) -> float:
-        senders = run(policies.get(name), self._episodes, self._capacity, self._scenario.value)
+    def _qoi_of_rule(self, rule: str | policies.Policy) -> float:
+        senders = run(policies.get(rule), self._episodes, self._capacity, self._scenario.value)
         return math.fsum(outcome(senders, i).qoi for i in range(len(self._episodes)))
 
     def _score(self, qoi: float) -> float:
@@ -208,15 +211,22 @@ def forget(curves: Path, run: Run) -> None:
     write_text(curves, text.getvalue())
 
 
-def summary(curves: Path, steps: int) -> list[str]:
-    """A table: each seed's score at the last evaluation within so many steps and one rollout, and their median."""
+def summary(curves: Path, steps: int, rules: Mapping[str, float]) -> list[str]:
+    """A table: each seed's score at the last evaluation within so many steps and one rollout, and their mean.
+
+    The interval of the mean is for other seeds on the same episodes; one seed has none. Rules and constant actions
+    stand below, best first.
+    """
     rows = []
     for one, of_seed in read(curves).items():
         last = [[point for point in curve if point[0] <= steps + ROLLOUT][-1] for curve in of_seed.values()]
-        scores, cpu_s = [score for _, score, _ in last], [seconds for *_, seconds in last]
-        each = ", ".join(f"{score:.2f}" for score in scores)
-        rows.append((one.label, f"{np.median(scores):.2f}", each, f"{np.median(cpu_s):.0f}"))
-    return table(("settings", f"median after {steps:,} steps", "seeds", "CPU s"), rows)
+        scores, cpu_s = np.array([score for _, score, _ in last]), [seconds for *_, seconds in last]
+        n = len(scores)
+        drawn = times_drawn(n, RESAMPLES, stream(SEED, one.label)) @ scores / n
+        mean = written(interval(drawn, n, within=(-math.inf, 1)), ".2f")
+        rows.append((one.label, mean, ", ".join(f"{score:.2f}" for score in scores), f"{np.median(cpu_s):.0f}"))
+    rows += [(name, f"{rules[name]:.2f}", "", "") for name in sorted(rules, key=lambda name: -rules[name])]
+    return table(("settings", f"mean after {steps:,} steps [95 %, over seeds]", "seeds", "CPU s"), rows)
 
 
 def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
@@ -229,7 +239,7 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
             axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=one.label if n == 0 else None)
     at_level: dict[float, list[str]] = {}
     for name, score in rules.items():
-        at_level.setdefault(round(score, 3), []).append(name)
+        at_level.setdefault(round(score, 2), []).append(name)  # closer ones would be written over each other
     for score, names in at_level.items():
         axes.axhline(score, color="black", linewidth=0.8, linestyle=":")
         axes.annotate(
@@ -259,11 +269,11 @@ def page(
     torch.set_num_threads(1)
     of_task = task_of(task, data)
     fixed = Episodes(episodes, of_task, capacity)
-    rules = {name: fixed.of_rule(name) for name in RULES}
+    rules = {name: fixed.of_rule(rule) for name, rule in RULES.items()}
     print(", ".join(f"{name} {score:.3f}" for name, score in rules.items()), flush=True)
     if figure is not None:
         draw_curves(curves, rules, figure)
-        print(*summary(curves, steps), sep="\n")
+        print(*summary(curves, steps, rules), sep="\n")
         return
     curves.parent.mkdir(exist_ok=True)
     for seed in seeds:

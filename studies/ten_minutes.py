@@ -1,4 +1,4 @@
-"""The score after ten minutes of one core, for each library of docs/guide/trainers.md that trains a policy.
+"""The score after ten minutes of one core, for each library of examples/trainers that trains a policy.
 
 python -m studies.ten_minutes --library tianshou --minutes 10 --out runs/ten_minutes.csv
 

@@ -38,6 +38,7 @@ ELSEWHERE = {
     "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
     "studies.sb3_defaults": "studies/test_sb3_defaults.py",
     "studies.shipped": "studies/test_shipped.py",
+    "studies.yardstick": "studies/test_yardstick.py",
     "studies.sizes": "needs a recording, and PyAV",
     "studies.ten_minutes": "studies/test_ten_minutes.py, and it needs the other libraries",
     "website.films": "website/test_gallery.py",

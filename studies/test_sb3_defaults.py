@@ -7,7 +7,7 @@ from needs import needs
 
 pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
 
-from studies.sb3_defaults import Episodes, Run, draw_curves, forget, read, summary
+from studies.sb3_defaults import RULES, Episodes, Run, draw_curves, forget, read, summary
 
 CURVES = """\
 trainer,reward,actions,rows,task,capacity,repeat,seed,steps,score,cpu_s
@@ -23,11 +23,16 @@ PPO,paired,candidates,8,lte,8,3,0,100352,0.6,40.0
 
 def test_the_score_after_so_many_steps_is_that_of_the_rollout_that_reaches_them(tmp_path: Path) -> None:
     (tmp_path / "curves.csv").write_text(CURVES)
-    lines = summary(tmp_path / "curves.csv", 100_000)
-    assert lines[2:] == [
-        "| PPO, regret | 0.30 | 0.20, 0.40 | 25 |",
-        "| DQN, retained, 8 rows, generated-v1, L = 16, slots | 0.50 | 0.50 | 9 |",
-        "| PPO, paired, 8 rows, held for 3 | 0.60 | 0.60 | 40 |",
+    lines = summary(tmp_path / "curves.csv", 100_000, {"chance": -0.1, "afr": 0.3})
+    # .2 and .4: the mean's error is .1, and Student's t with one degree of freedom 12.706; a score ends at 1.
+    first, low = lines[2].partition("[")[0], float(lines[2].partition("[")[2].partition(",")[0])
+    assert first == "| PPO, regret | 0.30 " and low == pytest.approx(0.3 - 1.27, abs=0.05)
+    assert lines[2].endswith(", 1.00] | 0.20, 0.40 | 25 |")
+    assert lines[3:] == [
+        "| DQN, retained, 8 rows, generated-v1, L = 16, slots | 0.50 [–] | 0.50 | 9 |",
+        "| PPO, paired, 8 rows, held for 3 | 0.60 [–] | 0.60 | 40 |",
+        "| afr | 0.30 |  |  |",
+        "| chance | -0.10 |  |  |",
     ]
     draw_curves(tmp_path / "curves.csv", {"afr": 0.3}, tmp_path / "curves.svg")
     assert "<svg" in (tmp_path / "curves.svg").read_text()
@@ -51,3 +56,4 @@ def test_drop_oldest_is_0_and_other_rules_are_better() -> None:
     episodes = Episodes(3)
     assert episodes.of_rule("drop-oldest") == 0
     assert 0 < episodes.of_rule("afr") < episodes.of_rule("target-gap") < 1
+    assert episodes.of_rule(RULES["always 0"]) == episodes.of_rule("min-motion-gap") > episodes.of_rule(RULES["chance"])

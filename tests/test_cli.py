@@ -81,7 +81,7 @@ def test_play_writes_a_film(tmp_path: Path) -> None:
 
 
 def test_play_ends_where_bench_does(capsys: Capsys) -> None:
-    words = "play --env Interruption-v0 --policies afr --speed 0 --seed 3 --capacity 4 --steps 400"
+    words = "play --env Interruption-v0 --policies afr --speed 1000 --seed 3 --capacity 4 --steps 400"
     over = shown(words.split(), capsys).splitlines()[-1]
     (row,) = run([policies.get("afr")], scenario.get("interruption"), [4], [3])
     assert over == (

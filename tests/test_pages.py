@@ -25,7 +25,9 @@ from website import policies as policy_page
 REPO = Path(__file__).resolve().parent.parent
 WRITTEN = [
     *("README.md", "CONTRIBUTING.md", "SECURITY.md", "agents/pretrained/README.md", "traces/README.md"),
+    "packages/papers/PERCEPTION.md",
     *(path.relative_to(REPO).as_posix() for path in sorted((REPO / "docs").rglob("*.md"))),
+    *(path.relative_to(REPO).as_posix() for path in sorted((REPO / "results").glob("*.md"))),
 ]
 """Pages that are files. (The changelog names commands of its day.)"""
 
@@ -126,6 +128,18 @@ def test_links_and_pictures_lead_somewhere() -> None:
                 assert not anchor or anchor in anchors or 'id="' in text, (page, target)
 
 
+def test_what_a_docstring_cites_is_a_title_of_that_page() -> None:
+    sources = [path for top in ("bufgym", "packages", "agents", "studies") for path in (REPO / top).rglob("*.py")]
+    cited = [
+        (path, page, " ".join(title.split()))
+        for path in sources
+        for page, title in re.findall(r'([\w/]+\.md),\s+"([^"]+)"', path.read_text(encoding="utf-8"))
+    ]
+    assert len(cited) > 20
+    for path, page, title in cited:
+        assert f"# {title}\n" in (REPO / page).read_text(encoding="utf-8"), (path, page, title)
+
+
 RUN = {
     r"bufgym bench --policies learned,afr": "--seconds 2 --seeds 1",
     r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",
@@ -136,7 +150,7 @@ RUN = {
     r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
     r"bufgym (--help|list \w+|trace fetch --list)": "",
     r"bufgym trace generate .*": "-o made.csv",
-    r"bufgym play --policies .*": "--speed 0 --steps 20",
+    r"bufgym play --policies .*": "--speed 1000 --steps 20",
 }
 """Pattern of a whole command -> the settings behind it that make it short. Others have tests of their own."""
 
@@ -190,9 +204,7 @@ ELSEWHERE = {
     "docs/guide/ros1.md": "packages/live/tests/robot/test_ros1.py",
     "docs/guide/ros2.md": "packages/live/tests/robot/test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
-    "docs/guide/trainers.md": "tests/test_trainers.py",
     "docs/guide/yours-to-change.md": "below",
-    "docs/fleet.md": "it trains for minutes; what it imports is looked at above",
 }
 """Page -> what runs its programs."""
 

@@ -17,6 +17,7 @@ from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
+import bufgym
 from bufgym import cli, policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.policies import weights
@@ -143,6 +144,8 @@ def test_any_perceptron_of_up_to_three_layers_is_compiled(widths: list[int], act
         (PPO, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.ELU}}, {"decide_at": "overflow"}),
         (MaskablePPO, "MlpPolicy", {"policy_kwargs": {"net_arch": [257]}}, {}),
         (QRDQN, "MlpPolicy", {}, {}),
+        (PPO, "MlpPolicy", {}, {"fields": ["rate_short"]}),
+        (DQN, "MlpPolicy", {}, {"fields": ["time_to_free", "rate_short"]}),
         (PPO, "MultiInputPolicy", {}, {"observation": "dict"}),
         (MaskablePPO, "MultiInputPolicy", {}, {"observation": "dict", "fields": ["rate_short", "time_to_free"]}),
         (PPO, "MultiInputPolicy", {}, {"observation": "slots"}),
@@ -158,11 +161,12 @@ def test_other_networks_run_in_torch_for_every_L(algorithm: Any, policy: str, op
     refuse('only networks of PPO, A2C, MaskablePPO or DQN with "MlpPolicy" and at most 3 hidden', weights_of, model)
 
 
-def test_a_field_of_each_slot_ties_a_model_to_its_L() -> None:
-    env = {"observation": "dict", "fields": ["index_merged"], "capacity": 3}
-    model = model_of(PPO, "MultiInputPolicy", env=env)
+@pytest.mark.parametrize(("form", "network"), [("dict", "MultiInputPolicy"), ("flat", "MlpPolicy")])
+def test_a_field_of_each_slot_ties_a_model_to_its_L(form: str, network: str) -> None:
+    env = {"observation": form, "fields": ["rate_short", "index_merged"], "capacity": 3}
+    model = model_of(PPO, network, env=env)
     policy = as_policy(model, "tied")
-    assert_same(policy, model, 3, observation="dict", fields=env["fields"])
+    assert_same(policy, model, 3, observation=form, fields=env["fields"])
     refuse(
         "policy tied: trained for L = 3, not for L = 5, as it observes",
         run,
@@ -173,15 +177,26 @@ def test_a_field_of_each_slot_ties_a_model_to_its_L() -> None:
     )
 
 
+def test_names_of_a_flat_models_fields_are_in_its_file(tmp_path: Path) -> None:
+    """27 numbers of two candidates, the head and the queue, then the two named ones in the order they were named."""
+    fields = ["time_to_free", "rate_short"]
+    for order in (fields, fields[::-1]):
+        model = model_of(PPO, env={"fields": order, "decide_at": "arrival"})
+        assert model.observation_space.shape == (29,) and [*model.observation_space.fields][-2:] == order
+        model.save(tmp_path / "named.zip")
+        assert_same(as_policy(tmp_path / "named.zip"), model, 8, fields=order, decide_at="arrival")
+
+
 def test_what_cannot_be_a_policy_or_a_file_is_refused(tmp_path: Path) -> None:
     normalized: Any = PPO("MlpPolicy", VecNormalize(make_vec_env("bufgym/Uplink-v0", 2, **WORLD)), device="cpu")
     for reads in (as_policy, weights_of):
         refuse("observes through VecNormalize .*train with norm_obs=False", reads, normalized)
     rewards: Any = VecNormalize(make_vec_env("bufgym/Uplink-v0", 2, **WORLD), norm_obs=False)
     assert as_policy(PPO("MlpPolicy", rewards, device="cpu")).compile
-    further = model_of(PPO, env={"fields": ["rate_short"]})
+    nameless: Any = model_of(PPO, env={"fields": ["rate_short"]})
+    del nameless.observation_space.fields  # as of a wrapper that makes a space of its own
     refuse(
-        r"observes 28 numbers: must be the 29 of .* for L = 1; of candidates 21 or 27, and further", as_policy, further
+        r"observes 28 numbers: must be the 29 of .* for L = 1; of candidates 21 or 27, and further", as_policy, nameless
     )
     recurrent: Any = RecurrentPPO("MlpLstmPolicy", make_vec_env("bufgym/Uplink-v0", 2, **WORLD), device="cpu")
     refuse("recurrent", as_policy, recurrent)
@@ -201,3 +216,13 @@ def test_weights_are_those_of_the_model() -> None:
     torch_first, _, torch_last = model.q_net.q_net
     assert np.array_equal(first.T, torch_first.weight.detach()) and np.array_equal(last.T, torch_last.weight.detach())
     assert np.array_equal(bias, torch_first.bias.detach())
+
+
+def test_a_model_in_torch_runs_on_a_suite_and_its_folder_knows_its_numbers(tmp_path: Path) -> None:
+    lab = bufgym.suite("lab-v1", SCENARIO, capacity=3, seeds=1)
+    models = [model_of(PPO, seed=seed, env={"fields": ["rate_short"], "capacity": 3}) for seed in (4, 5)]
+    first, other = (as_policy(model, "mine") for model in models)
+    done = bufgym.compare(first, lab, out=tmp_path / "out", progress=False)
+    again = bufgym.compare(as_policy(models[0], "mine"), lab, out=tmp_path / "out", progress=False)
+    assert repr(again.rows) == repr(done.rows)
+    refuse("made_of is .*never mixed", bufgym.compare, other, lab, out=tmp_path / "out", progress=False)

@@ -14,6 +14,7 @@ from train_cases import KilledError, columns, in_a_folder_of_its_own  # noqa: F4
 import train
 from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
+from agents.constants import NAMES
 from agents.held_out import FixedEpisodes
 from agents.learner import learner_of
 from agents.report import verdict
@@ -53,7 +54,9 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     rows = {row["policy"]: row for row in results["scores"]}
-    assert set(rows) == {*registry.names(for_topics=False), "agent (seed 0)"} and len(rows) == len(results["scores"])
+    assert set(rows) == {*registry.names(for_topics=False), *NAMES, "agent (seed 0)"} and len(rows) == len(
+        results["scores"]
+    )
     assert list(rows) == sorted(rows, key=lambda name: -rows[name]["qoi"])
     assert all(row["arrived"] == pytest.approx(row["delivered"] + row["dropped"]) for row in rows.values())
     assert len({row["arrived"] for row in rows.values()}) == 1  # all met the same episodes
@@ -284,6 +287,23 @@ def test_without_words_two_ways_are_compared(monkeypatch: pytest.MonkeyPatch) ->
     assert asked == [(Hindsight(), [PPO(steps=60_000)])]
 
 
+def test_seeds_together_have_an_interval_over_seeds_and_links() -> None:
+    """Two rules stand for two trainings: the mean of their scores, and no narrower than the better known of the two."""
+    test = FixedEpisodes(dataclasses.replace(ON, duration_s=10.0), "test", 6)
+    outcomes = {name: test.play(policies.get(name)) for name in ("drop-oldest", "afr", "target-gap", "min-motion-gap")}
+    rows, agents = test.rows(outcomes), [(0, "target-gap"), (1, "min-motion-gap")]
+    joined = held_out.together(rows, {"ppo": agents})["ppo"]
+    alone = {name: test.score(outcomes[name]) for _, name in agents}
+    assert joined.score.value == pytest.approx(sum(alone.values()) / 2)
+    # Two seeds: their mean's error is half of their difference, and Student's t with one degree of freedom is 12.7.
+    away = abs(alone["target-gap"] - alone["min-motion-gap"]) / 2
+    assert joined.score.value - joined.score.low > 12 * away > 0 and joined.score.high <= 1
+    assert joined.difference.value == pytest.approx(
+        np.mean([outcome.qoi for _, name in agents for outcome in outcomes[name]])
+        - np.mean([outcome.qoi for outcome in outcomes["afr"]])
+    )
+
+
 def test_the_verdict_says_how_far_above_whom() -> None:
     def entry(policy: str, score: float, low: float, high: float) -> dict[str, Any]:
         return {"policy": policy, "score": score, "minus_agent_95": [low, high]}
@@ -291,10 +311,11 @@ def test_the_verdict_says_how_far_above_whom() -> None:
     entries = [
         *(entry("learned", 0.75, 0.1, 0.3), entry("a", 0.7, 0.0, 0.0), entry("min-gap", 0.69, -0.2, 0.1)),
         *(entry("agent by ppo (seed 1)", 0.6, -2.0, -1.0), entry("agent by ppo (seed 0)", 0.5, -3.0, -1.0)),
-        entry("afr", 0.4, -5.0, -4.0),
+        *(entry("always 1", 0.45, -5.0, -4.0), entry("afr", 0.4, -5.0, -4.0), entry("always 0", 0.3, -5.0, -4.0)),
     ]
     assert verdict(entries, "a", 61.4, "hindsight", "other links") == (
-        "after 61 s a, by hindsight, scores 0.700 on episodes of other links: above AFR by 0.300, "
+        "after 61 s a, by hindsight, scores 0.700 on episodes of other links: "
+        "above the better constant action, always 1, by 0.250, above AFR by 0.300, "
         "level with the best rule written by hand, min-gap, (+0.010), "
         "below learned by 0.050, above agent by ppo (seed 1) by 0.100"
     )

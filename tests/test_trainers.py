@@ -1,4 +1,4 @@
-"""Each program of docs/guide/trainers.md runs, where its library is installed.
+"""Each program of examples/trainers runs, where its library is installed.
 
 A library that pins other versions than bufgym's tests use has an environment of its own: ``BUFGYM_TRAINERS`` names a
 folder of them, ``venv-skrl`` for ``skrl``. The interpreter that runs the tests serves the others.
@@ -16,8 +16,10 @@ from needs import needs
 
 REPO = Path(__file__).resolve().parent.parent
 PAGE = (REPO / "docs" / "guide" / "trainers.md").read_text(encoding="utf-8")
-PROGRAMS: dict[str, str] = dict(re.findall(r"^```python\n# (\w+)\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
-"""Package that a program's first line names -> the program."""
+PROGRAMS = {
+    path.stem.removeprefix("with_"): path for path in sorted((REPO / "examples" / "trainers").glob("with_*.py"))
+}
+"""Package -> the program that trains with it."""
 QUICK = ("tianshou", "torch", "torchrl")
 """Those that run with every test, if they are installed."""
 FOLDER = "BUFGYM_TRAINERS"
@@ -32,8 +34,9 @@ def interpreter(package: str) -> str | None:
 
 
 def test_every_library_of_the_table_has_a_program() -> None:
-    listed = re.findall(r"^\| [^|]+ \| `(\w+)` \|", PAGE, re.MULTILINE)
-    assert len(listed) > 2 and sorted(listed) == sorted(PROGRAMS)
+    rows = re.findall(r"^\| \[[^|]+\]\(([^|]+)\) \| `(\w+)` \|", PAGE, re.MULTILINE)
+    assert len(rows) > 2 and sorted(package for _, package in rows) == sorted(PROGRAMS)
+    assert not [link for link, package in rows if Path(link).name != PROGRAMS[package].name]
     [nightly] = re.findall(r"^ +library: \[(.*)\]$", (REPO / ".github/workflows/nightly.yml").read_text(), re.MULTILINE)
     assert sorted(nightly.split(", ")) == sorted(PROGRAMS)
 
@@ -41,13 +44,12 @@ def test_every_library_of_the_table_has_a_program() -> None:
 @pytest.mark.parametrize(
     "package", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.nightly) for name in PROGRAMS]
 )
-def test_the_program_of_the_page_runs(package: str, tmp_path: Path) -> None:
+def test_the_program_runs(package: str, tmp_path: Path) -> None:
     python = interpreter(package)
     if python is None:
         pytest.skip(needs("torchrl" if package == "torchrl" else "trainers", package))
     path = os.pathsep.join(str(REPO / part) for part in ("", "packages/live", "packages/papers"))
     where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data"), "OMP_NUM_THREADS": "1"}
-    (tmp_path / "program.py").write_text(PROGRAMS[package])
-    command = [python, "program.py"]
+    command = [python, str(PROGRAMS[package])]
     done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]

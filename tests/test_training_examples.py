@@ -13,6 +13,7 @@ import pytest
 from cli_cases import Capsys, Patch
 from needs import needs
 
+import bufgym
 from bufgym.benchmark import leaderboard
 from bufgym.jit import JIT
 
@@ -113,3 +114,36 @@ def test_the_example_learns_two_iterations() -> None:
     assert len(returns) == 2, done.stdout
     # The sum over two robots of H - 1, where V <= 1 and 90 frames arrive.
     assert all(0 < float(total) < 2 * 90 for total in returns)
+
+
+def test_an_agent_of_the_paper_learns_on_its_suite(tmp_path: Path) -> None:
+    """One agent of the six, for one episode or two; then it is there, and is not trained again."""
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
+    assert sum(line != "" for line in (EXAMPLES / "paper.py").read_text().splitlines()) <= 60
+    from bufgym.sb3 import as_policy
+
+    paper = example("paper.py")
+    for _ in range(2):
+        paper["train"](("dqn", 0), 400, tmp_path)
+        (curve,) = bufgym.curves(tmp_path / "dqn", tmp_path / "curves.svg")
+        assert curve.measure == "return" and 200 < curve.steps[-1] <= 400 and len(curve.seeds) == 1
+        paper["TRAINERS"].clear()
+    model = as_policy(tmp_path / "dqn" / "seed-0" / "model.zip", "mine")
+    done = bufgym.compare([model, paper["every_second"], "afr"], "halls-v1", seeds=1, progress=False)
+    assert {e["policy"] for e in done.estimates} == {"mine", "every_second", "afr", "drop-oldest"}
+    assert done.write_estimates(tmp_path / "all.csv").read_text().startswith("policy,scenario,capacity,quantity,est")
+
+
+@pytest.mark.nightly
+def test_a_papers_worth_from_one_program(tmp_path: Path) -> None:
+    """Two agents with three seeds beside three rules: a table of ten rows, its numbers, and a figure of two runs."""
+    pytest.importorskip("stable_baselines3", reason=needs("extras", "stable_baselines3"))
+    pytest.importorskip("matplotlib", reason=needs("extras", "matplotlib"))
+    words = [sys.executable, str(EXAMPLES / "paper.py"), "--steps", "400", "--episodes", "1", "--out", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    table = (tmp_path / "table.tex").read_text()
+    names = [f"{name}-{seed}" for name in ("ppo", "dqn") for seed in range(3)]
+    assert all(table.count(f"& {name} &") == 1 for name in [*names, r"every\_second", "target-gap", "afr"])
+    assert (tmp_path / "estimates.csv").read_text().startswith("policy,scenario,capacity,quantity,estimate,low,high\n")
+    assert all(f"{name} (3 seeds)" in (tmp_path / "curves.svg").read_text() for name in ("ppo", "dqn"))

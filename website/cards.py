@@ -9,7 +9,7 @@ from pathlib import Path
 from bufgym.benchmark import leaderboard
 from website.markdown import table
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+REPO = Path(__file__).resolve().parent.parent
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Card:
 
 CARDS = {
     "learned": Card(
-        results="agents.md",
+        results="results/agents.md",
         decides="what to drop from one queue, of any L",
         sees="the queue, the clock, the socket, V, sizes, the link's rate, and odometry where there is any",
         kind="a network among ordered candidates and the decision of the rule `gap-price`",
@@ -73,7 +73,7 @@ def trained_by(card: Card) -> str:
 
 def board(name: str) -> list[tuple[str, str, str]]:
     """(suite, share of AFR's regret, score) of the agent as it comes with bufgym, from the leaderboard."""
-    entries = leaderboard.read(DOCS / "leaderboard.csv")
+    entries = leaderboard.read(REPO / "results/leaderboard.csv")
     rows = []
     for entry in entries.values():
         rival = entries.get(f"{entry.suite}/afr")
@@ -87,7 +87,7 @@ def _board(name: str) -> list[str]:
     rows = board(name)
     return (
         [
-            "As it comes, over the discriminative cells ([leaderboard](leaderboard.md)):",
+            "As it comes, over the discriminative cells ([leaderboard](results/leaderboard.md)):",
             table(("suite", "regret / AFR's", "score"), rows),
         ]
         if rows
@@ -96,4 +96,4 @@ def _board(name: str) -> list[str]:
 
 
 def _text(card: Card) -> str:
-    return (DOCS / card.results).read_text(encoding="utf-8")
+    return (REPO / card.results).read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ from typing import Any
 import bufgym
 from bufgym import scenario
 from bufgym.cli.listing import SYMBOLS
+from bufgym.envs.options import Options
 from bufgym.model.observe import (
     CANDIDATE_FIELDS,
     FIELDS,
@@ -64,6 +65,8 @@ SCENARIOS = bufgym.ENVIRONMENTS | {"bufgym/Mapping-v0": MAPPING}
 TOPICS = """\
 Many topics share one uplink: decide at every arrival what to drop, and at every free socket what to send next."""
 
+
+WHICH_REWARD = "[Which one when](../guide/environments.md#rewards)"
 
 INTERFACES = """\
 ![A queue of eight messages and a newcomer: three actions with candidates, ten with slots](../figures/candidates.svg)
@@ -135,12 +138,12 @@ def page(id: str) -> str:
         lines += ["## Action", INTERFACES, code(parts["Action"])]
         lines += ["## Observation", code(parts["Observation"])]
         lines += [f"{SYMBOLS}.", _fields((*CANDIDATE_FIELDS, *QUEUE_FIELDS))]
-    lines += ["## Reward", code(parts["Reward"]), _rewards(REWARD_TERMS + more)]
+    lines += ["## Reward", code(parts["Reward"]), WHICH_REWARD, _rewards(REWARD_TERMS + more)]
     lines += ["### Returns of rules", RETURN, _returns(id)]
     if one_queue:
         lines += ["## Slots", code(parts["Slots"]), _slot_fields(topics)]
     lines += ["## Episode end", code(parts["Episode end"])]
-    lines += ["## Arguments", code(parts["Arguments"])]
+    lines += ["## Arguments", code(parts["Arguments"]), parameters(Options())]
     lines += [
         "## Parameters of the scenario",
         "Each is an argument of the environment, too.",

@@ -8,7 +8,7 @@ BIB = Path(__file__).resolve().parent.parent / "docs" / "references.bib"
 
 def page() -> str:
     """The whole page."""
-    lines = ["# Papers, data sets and systems", "[Claims of the papers with our numbers](claims.md)"]
+    lines = ["# Papers, data sets and systems", "[Claims of the papers with our numbers](results/claims.md)"]
     for part in re.split(r"^% --- ", BIB.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
         title, _, entries = part.partition("\n")
         lines += [f"## {title[0].upper()}{title[1:]}"]

@@ -37,7 +37,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("policy")
-    parser.add_argument("--into", type=Path, default=Path("docs/leaderboard.csv"))
+    parser.add_argument("--into", type=Path, default=Path("results/leaderboard.csv"))
     given = parser.parse_args()
     try:
         put(given.folder, given.policy, given.into)

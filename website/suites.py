@@ -12,8 +12,8 @@ bufgym bench --suite lte-v1 --out results/lte
 bufgym report results/lte
 ```
 
-The *score* of a policy is 0 for Drop Oldest and 1 for the clairvoyant. The [leaderboard](leaderboard.md) lists all
-policies, each row with the command that makes it again.
+The *score* of a policy is 0 for Drop Oldest and 1 for the clairvoyant. The [leaderboard](results/leaderboard.md) lists
+all policies, each row with the command that makes it again.
 """
 
 

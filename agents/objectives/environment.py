@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.constants import NAMES, UNTAUGHT
 from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, by_hand, report_environment
@@ -42,10 +43,11 @@ class EnvironmentObjective(Objective):
         return make_vec_env(on.env, num_envs, scenario=scenario, capacity=on.capacity, reward=reward, **options)
 
     def lines_to_beat(self) -> dict[str, float]:
-        """Drop Oldest, AFR and the best rule written by hand."""
-        scores = {name: self.judges.score(self.judges.play(policies.get(name))) for name in by_hand()}
-        best = max(scores, key=lambda name: scores[name])
-        lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "afr", best))}
+        """Drop Oldest, chance, AFR, constant actions and the best rule written by hand."""
+        rules = [policies.get(name) for name in by_hand()]
+        scores = {policy.name: self.judges.score(self.judges.play(policy)) for policy in (*rules, *UNTAUGHT)}
+        best = max((rule.name for rule in rules), key=lambda name: scores[name])
+        lines = {name: scores[name] for name in dict.fromkeys((BASELINE, "chance", "afr", *NAMES, best))}
         listed = ", ".join(f"{name} {score:.3f}" for name, score in lines.items())
         print(f"to beat on validation (score: 0 is {BASELINE}, 1 the clairvoyant): {listed}", flush=True)
         return lines

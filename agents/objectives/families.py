@@ -6,6 +6,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
+from agents.constants import UNTAUGHT
 from agents.families import Family
 from agents.objectives.objective import Objective
 from agents.ready_families import runs_of
@@ -53,13 +54,13 @@ class FamiliesObjective(Objective):
         """A table of every seed's agent beside rules on the test runs of each family."""
         kept = zip(trained.runs, trained.agents, strict=True)
         agents = [replace(agent, name=agent_name(run)) for run, agent in kept if isinstance(agent, Policy)]
-        rivals = [policies.get(name) for name in RIVALS]
+        rivals = [*UNTAUGHT, *(policies.get(name) for name in RIVALS)]
         lines = [["family", "runs", *(p.name for p in (*agents, *rivals)), *(f"best - {n} [95 %]" for n in RIVALS)]]
         chosen = [run.seed for run in trained.runs].index(trained.best.seed)
         for family in _families(self.names, "test", TEST_RUNS, self.data):
             found = family.against([*agents, *rivals])
             shares = [f"{share:.3f}" for share, _ in found]
-            behind = [_text(interval) for interval in found[chosen][1][len(agents) :]]
+            behind = [_text(interval) for interval in found[chosen][1][-len(RIVALS) :]]
             lines.append([family.name, str(len(family.best)), *shares, *behind])
         text = "\n".join([*aligned(lines), "shares of AFR's regret: 0 is the clairvoyant, 1 AFR"])
         (trained.folder / "results.txt").write_text(text + "\n", encoding="utf-8")

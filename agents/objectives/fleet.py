@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.constants import UNTAUGHT
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, report_rows
 from agents.settings import Settings
@@ -108,4 +109,5 @@ class FleetObjective(Objective):
 
     def report(self, trained: Trained) -> Report:
         """A row of the benchmark for each agent and fixed policy in each episode of the test split."""
-        return report_rows(trained, [policies.get(name) for name in tasks.TASKS["fleet"].default_policies()])
+        fixed = map(policies.get, tasks.TASKS["fleet"].default_policies())
+        return report_rows(trained, [*UNTAUGHT, *fixed])

@@ -4,6 +4,7 @@ A statistic is computed for the sample and for each of its resamples at once: ro
 often its intervals cover is simulated by ``studies.coverage``.
 """
 
+import functools
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +18,10 @@ from bufgym.benchmark.episodes import Episode, Numbers
 from bufgym.benchmark.table import NONE
 
 RESAMPLES, CONFIDENCE, SEED = 2000, 0.95, 0  # Resamples, confidence of the intervals and seed of the draws
-REALS = -math.inf, math.inf
+Range = tuple[float, float]
+REALS: Range = (-math.inf, math.inf)
+NOT_NEGATIVE: Range = (0.0, math.inf)
+SHARES: Range = (0.0, 1.0)  # Of probabilities, regrets and all that counts a part of something
 ROUNDING = 1e-12  # Numbers up to this size are 0: sums of the same terms in another order
 
 
@@ -68,13 +72,39 @@ def links_drawn(
     draws: dict[int, Numbers] = {}
     counts = {}
     for scenario, met in episodes.items():
-        links = _links(met)
-        place = {link: k for k, link in enumerate(sorted(set(links)))}
-        n = len(place)
+        places = places_of(met)
+        n = max(places) + 1
         draws.setdefault(n, times_drawn(n, resamples, stream(seed, f"{n} links")))
         # In the order of ``times_drawn``, so that sums over row 0 round as they do there.
-        counts[scenario] = np.ascontiguousarray(draws[n][:, [place[link] for link in links]])
+        counts[scenario] = np.ascontiguousarray(draws[n][:, places])
     return counts
+
+
+def places_of(met: Sequence[Episode]) -> list[int]:
+    """Which of the drawn links each episode belongs to, counted from 0 in the order of their names."""
+    links = _links(met)
+    place = {link: k for k, link in enumerate(sorted(set(links)))}
+    return [place[link] for link in links]
+
+
+def carriers(losses: Numbers) -> int:
+    """How few links carry half of the loss; ``losses`` has that of each link."""
+    most = np.cumsum(np.sort(losses.clip(0))[::-1])
+    return int(np.searchsorted(most, most[-1] / 2 * (1 - ROUNDING))) + 1
+
+
+def remark(losses: Numbers, loser: str, drawn: str) -> list[str]:
+    """A note where one or two of those ``drawn``, a quarter of all at most, carry half of what ``loser`` loses.
+
+    What such rare links do decides about all sums, and a sample that has none of them shows nothing of it: no interval
+    made of the sample alone can know. ``studies.coverage --rare`` simulates it.
+    """
+    few = carriers(losses)
+    if few > 2 or 4 * few > len(losses):
+        return []
+    carry = "carries" if few == 1 else "carry"
+    what = f"{few} of {len(losses)} {drawn} {carry} half of what {loser} loses"
+    return [f"note: {what}: intervals over so few may hold the true number far less often than 95 %"]
 
 
 def _links(met: Sequence[Episode]) -> list[Any]:
@@ -88,32 +118,31 @@ def links_in(episodes: Mapping[str, Sequence[Episode]]) -> int:
     return min((len(set(_links(met))) for met in episodes.values()), default=0)
 
 
+@functools.cache
 def students_t(confidence: float, freedom: int) -> float:
     """How many standard errors an interval of this confidence reaches to either side, with so many degrees of freedom.
 
-    From five on by the expansion of Abramowitz and Stegun (1964), 26.7.5, to 1e-3; below from the distribution itself.
+    For whole degrees the distribution is a finite sum (Abramowitz and Stegun 1964, 26.7.3 and 26.7.4) in the angle
+    theta = atan(t / sqrt(freedom)), which bisection solves to the last digits.
     """
-    p = (1 + confidence) / 2
-    if freedom == 1:
-        return math.tan(math.pi * (p - 0.5))
-    if freedom == 2:
-        return (2 * p - 1) * math.sqrt(2 / (4 * p * (1 - p)))
-    if freedom == 4:
-        a = 4 * p * (1 - p)
-        return 2 * math.sqrt(math.cos(math.acos(math.sqrt(a)) / 3) / math.sqrt(a) - 1)
-    x, n = NormalDist().inv_cdf(p), freedom
-    terms = (
-        (x**3 + x) / 4,
-        (5 * x**5 + 16 * x**3 + 3 * x) / 96,
-        (3 * x**7 + 19 * x**5 + 17 * x**3 - 15 * x) / 384,
-        (79 * x**9 + 776 * x**7 + 1482 * x**5 - 1920 * x**3 - 945 * x) / 92160,
-    )
-    return x + math.fsum(term / n ** (k + 1) for k, term in enumerate(terms))
+    odd = freedom % 2
+    k = np.arange(1, (freedom - 1 - odd) // 2 + 1)
+    factors = np.cumprod(np.concatenate([[1.0], (2 * k - 1 + odd) / (2 * k + odd)]))
+    powers = 2 * np.arange(len(factors)) + odd
+
+    def within(theta: float) -> float:
+        """Probability of -t to t."""
+        terms = math.sin(theta) * float(factors @ math.cos(theta) ** powers)
+        return 2 / math.pi * (theta + terms * (freedom > 1)) if odd else terms
+
+    low, high = 0.0, math.pi / 2
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if within(middle) < confidence else (low, middle)
+    return math.sqrt(freedom) * math.tan(low)
 
 
-def interval(
-    numbers: Numbers, links: int, confidence: float = CONFIDENCE, within: tuple[float, float] = REALS
-) -> Interval:
+def interval(numbers: Numbers, links: int, confidence: float = CONFIDENCE, within: Range = REALS) -> Interval:
     """Compute the interval of a statistic from its [1 + resamples] numbers; NaN, an undefined one, is left out.
 
     It is the wider of two, both made for few ``links``. One is the bootstrap's standard error times a quantile of
@@ -131,10 +160,36 @@ def interval(
     reach = errors * float(np.std(drawn))
     level = NormalDist().cdf(-errors)
     low, high = np.quantile(drawn, [level, 1 - level]).tolist()
-    return Interval(value, max(min(low, value - reach), within[0]), min(max(high, value + reach), within[1]))
+    return _kept(Interval(value, min(low, value - reach), max(high, value + reach)), within)
+
+
+def _kept(found: Interval, within: Range) -> Interval:
+    """The interval, of which no bound leaves ``within``."""
+    value, low, high = found
+    return Interval(value, min(max(low, within[0]), value), max(min(high, within[1]), value))
+
+
+def together(levels: Sequence[tuple[Numbers, int]], within: Range = REALS) -> Interval:
+    """Compute the interval of a statistic over independent levels of chance, such as links and training seeds.
+
+    Each level has the numbers found by drawing it alone, [1 + resamples], and how many units were drawn, so that it
+    has degrees of freedom of its own. One that the statistic does not depend on has the sample's number alone.
+
+    To either side the reaches of the levels' intervals add as squares (Zou and Donner 2008, "Construction of confidence
+    limits about effect measures: a general approach", Statistics in Medicine 27). For two normal means this holds the
+    true value at least as often as each level's interval does, however few units each level has (Banerjee 1961,
+    Sankhya 23). Chance that both levels see, such as how well one agent does on one link, counts twice.
+    """
+    value, low, high = interval(*levels[0])
+    others = [interval(numbers, units) for numbers, units in levels[1:] if len(numbers) > 1]
+    if others:
+        low = value - math.hypot(value - low, *(other.value - other.low for other in others))
+        high = value + math.hypot(high - value, *(other.high - other.value for other in others))
+    return _kept(Interval(value, low, high), within)
 
 
 def ratio(above: Numbers, below: Numbers, defined: NDArray[np.bool_]) -> Numbers:
     """Divide ``above`` by ``below`` where ``defined``; NaN elsewhere."""
-    quotient: Numbers = np.divide(above, below, out=np.full(below.shape, np.nan), where=defined)
+    shape = np.broadcast_shapes(above.shape, below.shape)
+    quotient: Numbers = np.divide(above, below, out=np.full(shape, np.nan), where=defined)
     return quotient

@@ -17,6 +17,14 @@ class WorkerDiedError(BufgymError):
     """A worker process died during its work: killed, out of memory, or crashed in compiled code."""
 
 
+def check(jobs: int, backend: str) -> None:
+    """Raise an error for processes or a backend that there cannot be."""
+    if jobs < -1 or jobs == 0:
+        raise BufgymError(f"jobs = {jobs}: must be a whole number >= 1, or -1 for one a core")
+    if backend not in BACKENDS:
+        raise BufgymError(f"backend = {backend!r}: must be one of {', '.join(BACKENDS)}")
+
+
 def spread(
     calls: Iterable[tuple[Any, tuple[Any, ...]]], count: int, jobs: int, backend: str, address: str | None
 ) -> Iterator[Any]:

@@ -10,16 +10,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bufgym import scenario as scenarios
+from bufgym import scenario as registered
 from bufgym.benchmark import folder, report, sources, table, tasks
 from bufgym.benchmark import sweep as sweeps
+from bufgym.benchmark.estimates import ESTIMATE, estimates
+from bufgym.benchmark.own_suite import suite_named
+from bufgym.benchmark.parts import run_parts
 from bufgym.benchmark.report import tables
 from bufgym.benchmark.rows import Layout, Row, write_rows
-from bufgym.benchmark.run import run
 from bufgym.benchmark.sources import PolicyLike as PolicyLike
 from bufgym.benchmark.sources import make_policy as make_policy
 from bufgym.benchmark.sweep import Sweep
-from bufgym.policies import Policy, registry
+from bufgym.policies import Policy
 from bufgym.scenario import suites
 from bufgym.scenario.registry import parameters
 from bufgym.scenario.texts import doubts
@@ -30,7 +32,8 @@ from bufgym.utils.modules import is_named
 
 KEYWORDS = ("capacity", "seeds", "progress", "about", "label", "against", "out", "form")
 OF_A_QUEUE = ("max_bytes", "decide_at", "bound")
-OF_A_SUITE = ("split", "data", "changes", "policy_file", "jobs", "backend", "address", "command")
+OF_PROCESSES = ("jobs", "backend", "address", "policy_file")
+OF_A_SUITE = ("split", "data", "changes", "command", *OF_PROCESSES)
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,22 +48,34 @@ class Comparison:
     """The policies that do not compete, with the reasons."""
     layout: Layout  # the columns of ``rows``
     page: Callable[[str], str]  # the page, for the command that it names
-    plain: str  # the table as aligned text
-    markdown: str
-    html: str
+    forms: Mapping[str, str]  # the table by form
+    estimates: list[dict[str, Any]]
+    """Each quantity of each policy, over "all" and by scenario and capacity: ``estimate``, ``low`` and ``high``."""
+
+    @property
+    def plain(self) -> str:
+        """The table as aligned text."""
+        return self.forms["plain"]
 
     def table(self, form: str = "plain") -> str:
-        """Means by policy: ``"plain"`` text or ``"markdown"``."""
-        if form not in ("plain", "markdown"):
-            raise BufgymError(f"form = {form!r}: must be 'plain' or 'markdown'")
-        return self.plain if form == "plain" else self.markdown
+        """Means by policy: ``"plain"`` text, ``"markdown"``, or ``"latex"`` (for the package booktabs)."""
+        if form not in (known := ("plain", "markdown", "latex")):
+            raise BufgymError(f"form = {form!r}: must be one of {', '.join(map(repr, known))}")
+        return self.forms[form]
 
-    def to_pandas(self) -> Any:
-        """``rows`` as a pandas DataFrame; ``scenario`` is the name, or ``about`` where it has none."""
+    def to_pandas(self, what: str = "rows") -> Any:
+        """``"rows"`` or ``"estimates"`` as a pandas DataFrame.
+
+        ``scenario`` in rows is the name, or ``about`` where it has none.
+        """
         try:
             import pandas  # type: ignore[import-untyped,unused-ignore]
         except ImportError:
             raise BufgymError("to_pandas needs pandas: pip install pandas") from None
+        if what not in ("rows", "estimates"):
+            raise BufgymError(f"what = {what!r}: must be 'rows' or 'estimates'")
+        if what == "estimates":
+            return pandas.DataFrame(self.estimates)
         about = self.about.partition("\n")[0]
         return pandas.DataFrame([{**row, "scenario": row["scenario"] or about} for row in self.rows])
 
@@ -94,9 +109,13 @@ class Comparison:
         """Write the rows to this ``.csv`` or ``.parquet`` file; return its path."""
         return write_rows(self.rows, path, self.layout)
 
+    def write_estimates(self, path: str | Path) -> Path:
+        """Write the estimates to this ``.csv`` or ``.parquet`` file; return its path."""
+        return write_rows(self.estimates, path, ESTIMATE)
+
     def write_table(self, path: Path) -> Path:
         """Write ``about`` and the table as Markdown to this file; return its path."""
-        return write_text(path, f"{self.about}\n\n{self.markdown}\n")
+        return write_text(path, f"{self.about}\n\n{self.forms['markdown']}\n")
 
     def __str__(self) -> str:
         return f"{self.about}\n\n{self.plain}"
@@ -104,7 +123,7 @@ class Comparison:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return f"<p>{html.escape(self.about)}</p>\n{self.html}"
+        return f"<p>{html.escape(self.about)}</p>\n{self.forms['html']}"
 
 
 def compare(
@@ -136,9 +155,10 @@ def compare(
             (of QoI over Robofleet's with topics, of the gain over AFR with a fleet). It and AFR run too.
         out: a folder that keeps the rows and the table; a suite's run in it is resumed, any other begins an empty one.
         form: format of the rows in ``out``, "parquet" or "csv"; by default parquet if pyarrow is installed.
-        settings: of a queue, ``max_bytes``, ``decide_at`` and ``bound`` (False leaves out the clairvoyant and all that
-            is measured against it). Of a suite, settings of ``Sweep`` and ``run_sweep``: ``split``, ``data``,
-            ``changes``, ``policy_file``, ``jobs``, ``backend``, ``address`` and ``command``. The others are parameters
+        settings: of processes, ``jobs`` (side by side, -1 for one a core; by default one, a suite's one a core),
+            ``backend``, ``address`` and ``policy_file``, as of ``run_sweep``. Of a queue, ``max_bytes``, ``decide_at``
+            and ``bound`` (False leaves out the clairvoyant and all that is measured against it). Of a suite, settings
+            of ``Sweep`` and ``run_sweep``: ``split``, ``data``, ``changes`` and ``command``. The others are parameters
             of a scenario that is named.
 
     Raises:
@@ -151,14 +171,16 @@ def compare(
         raise BufgymError("policies = []: need at least one")
     capacities = (capacity,) if isinstance(capacity, int) else tuple(capacity or ())
     on = os.fspath(on) if isinstance(on, os.PathLike) else on
-    if isinstance(on, str) and on in suites.SUITES:
+    frozen = suite_named(on)
+    if frozen:
         return _compare_on_suite(
-            entrants, on, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
+            entrants, frozen, rival, capacities, seeds, out=out, form=form, progress=progress, **settings
         )
     of_a_queue = {name: settings.pop(name) for name in OF_A_QUEUE if name in settings}
+    processes = {name: settings.pop(name) for name in OF_PROCESSES if name in settings}
     label, scenario = label or (on if isinstance(on, str) else ""), _scenario(on, settings)
-    about = "\n".join([about or label or scenarios.about(scenario), *doubts(scenario)])
-    words: dict[str, Any] = {"label": label, "about": about}
+    about = "\n".join([about or label or registered.about(scenario), *doubts(scenario)])
+    words: dict[str, Any] = {"label": label, "about": about, "processes": processes}
     play = partial(_compare_on_scenario, entrants, scenario, rival, capacities, seeds, progress=progress)
     if out is None:
         return play(**words, **of_a_queue)
@@ -174,14 +196,14 @@ def compare(
 def _scenario(on: Any, settings: dict[str, Any]) -> Any:
     """The scenario that ``on`` is or names; ``settings`` are parameters of one that is named."""
     named = isinstance(on, str)
-    if named and not (on.partition(":")[0] in scenarios.SCENARIOS or on.endswith(".toml") or is_named(on)):
-        raise unknown("scenario or suite", on, [*scenarios.SCENARIOS, *suites.SUITES])
-    scenario = scenarios.get(on) if named else on
+    if named and not (on.partition(":")[0] in registered.SCENARIOS or on.endswith(".toml") or is_named(on)):
+        raise unknown("scenario or suite", on, [*registered.SCENARIOS, *suites.SUITES])
+    scenario = registered.get(on) if named else on
     known = parameters(scenario) if named else []
     for name in settings:
         if name not in known:
             raise unknown("keyword", name, [*KEYWORDS, *OF_A_QUEUE, *OF_A_SUITE, *known], place="compare")
-    return scenarios.get(scenario, **settings) if settings else scenario
+    return registered.get(scenario, **settings) if settings else scenario
 
 
 def _compare_on_scenario(
@@ -194,6 +216,7 @@ def _compare_on_scenario(
     label: str,
     about: str,
     progress: bool,
+    processes: dict[str, Any],
     **of_a_queue: Any,
 ) -> Comparison:
     """Run the policies, summarise their rows, and render the summary."""
@@ -201,14 +224,15 @@ def _compare_on_scenario(
     invited = _with_rival(entrants, rival, task)
     players = _with_missing(invited, [make_policy(task.baseline)])
     seeds = task.seeds if seeds is None else seeds
-    how = {"label": label, "progress": progress, **of_a_queue}
-    played = run(players, scenario, capacities or (task.capacity,), seeds, **how)
+    processes["jobs"] = _jobs(players, processes.get("jobs"), processes.get("policy_file"))
+    how: dict[str, Any] = {"label": label, "progress": progress, **processes, **of_a_queue}
+    played = run_parts(players, scenario, capacities or (task.capacity,), seeds, **how)
     holes = [hole for trace in getattr(scenario, "traces", ()) for hole in trace.holes]
     if holes and task.kind == "queue":
         zero = not any(trace.rate_bytes_per_s([start for start, _ in trace.holes]).any() for trace in scenario.traces)
         used, other = ("zero", "hold") if zero else ("hold", "zero")
         filled = replace(scenario, traces=tuple(trace.with_holes(other) for trace in scenario.traces))
-        again = run(players, filled, capacities or (task.capacity,), seeds, **how)
+        again = run_parts(players, filled, capacities or (task.capacity,), seeds, **how)
         others = {(entry["policy"], entry["capacity"]): entry["qoi"] for entry in table.means(again)}
         both = ", ".join(
             f"{entry['policy']} {entry['qoi']:.3f} or {others[entry['policy'], entry['capacity']]:.3f}"
@@ -221,10 +245,10 @@ def _compare_on_scenario(
 
     hidden = "" if task.shows_baseline or players == invited else task.baseline
     rendered = [part.forms() for part in task.tables(played, summary, scenario, unranked, hidden)]
-    forms = ["\n\n".join(texts) for texts in zip(*rendered, strict=True)]
+    forms = {name: "\n\n".join(part[name] for part in rendered) for name in rendered[0]}
     page = partial(report.page_of_rows, task, played, players, unranked, scenario, about)
     rows = [row for row in played if row["policy"] != hidden]
-    return Comparison(rows, about, unranked, task.layout, page, *forms)
+    return Comparison(rows, about, unranked, task.layout, page, forms, estimates(summary))
 
 
 def _compare_on_suite(
@@ -243,24 +267,28 @@ def _compare_on_suite(
     if seeds is not None and not isinstance(seeds, int):
         raise BufgymError(f"seeds = {seeds!r}: on a suite, must be how many")
     players = _with_rival(entrants, rival, tasks.task_of(suite))
-    registered = {*registry.names(), *registry.names(named_only=True)}
-    for policy in players:
-        base = policy.name.partition(":")[0]
-        if base not in registered or registry.get(base).on_arrival is not policy.on_arrival:
-            rule = "register it to run it on a suite, whose processes know it by name"
-            raise BufgymError(f"policy {policy.name}: {rule}")
     of_the_sweep = {field.name: how.pop(field.name) for field in fields(Sweep) if field.name in how}
     sweep = Sweep(suite, tuple(players), capacities=capacities, seeds=seeds, **of_the_sweep)
-    # Other processes can't know what a user's own code registered in this one.
-    if sweep.policy_file is None and not all(policy.built_in or sources.loaded([policy.name]) for policy in players):
-        how["jobs"] = 1
+    how["jobs"] = _jobs(players, how.get("jobs"), sweep.policy_file)
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(out or Path(scratch, "run"))
         rows = sweeps.run_sweep(sweep, place, **how)
         finished, summary = report.run_of(place, "" if rival is None else rival.name)
-    forms = tables.plain(finished, summary), tables.markdown(finished, summary), tables.html(summary)
+    forms = {"plain": tables.plain(finished, summary), "markdown": tables.markdown(finished, summary)}
+    forms |= {"html": tables.html(summary), "latex": tables.latex(summary)}
     unranked, page = table.unranked_among(players), partial(report.page_of_run, finished)
-    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, *forms)
+    return Comparison(rows, f"suite {suite}", unranked, sweep.task.layout, page, forms, estimates(summary))
+
+
+def _jobs(players: Sequence[Policy], asked: int | None, policy_file: str | None) -> int | None:
+    """How many processes: one where others can't know what this one's own code made, in a script or a notebook."""
+    alone = [policy.name for policy in players if not sources.known_elsewhere(policy)]
+    if not alone or policy_file is not None:
+        return asked
+    if asked not in (None, 1):
+        rule = "known to this process alone: jobs = 1, or name it as module:function or by its file"
+        raise BufgymError(f"policy {alone[0]}: {rule}")
+    return 1
 
 
 def _with_rival(entrants: Sequence[Policy], rival: Policy | None, task: tasks.Task) -> list[Policy]:

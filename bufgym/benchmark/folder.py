@@ -25,7 +25,7 @@ _MANIFEST = {
 }
 
 _SAME = [
-    *("format", "bufgym", "suite", "split", "policies", "policy_file", "sources"),
+    *("format", "bufgym", "suite", "split", "policies", "policy_file", "sources", "made_of"),
     *("capacities", "seeds", "changes", "scenarios"),
 ]
 """Entries that must be equal in two runs that share a folder."""

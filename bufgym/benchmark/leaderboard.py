@@ -3,6 +3,7 @@
 import hashlib
 import io
 import math
+import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -10,16 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bufgym import policies
-from bufgym.benchmark import folder
+from bufgym.benchmark import bootstrap, folder, score
 from bufgym.benchmark.bootstrap import Interval
 from bufgym.benchmark.rows import Layout, Row, parsed, write_rows
-from bufgym.benchmark.summary import places, shown
+from bufgym.benchmark.sources import made_of
+from bufgym.benchmark.summary import places, shown, summarise
 from bufgym.benchmark.sweep import Sweep, run_sweep
 from bufgym.benchmark.table import NONE, Table
 from bufgym.benchmark.tasks import task_of
 from bufgym.jit.fingerprint import fingerprint
-from bufgym.oracle import cached
 from bufgym.scenario import suites
 from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError, where
@@ -56,29 +56,43 @@ class Entry:
 
     @property
     def command(self) -> str:
-        needs = " --data DIR" if suites.get(self.suite).needs else ""
-        return f"bufgym bench --suite {self.suite} --policies {self.policy}{needs}"
+        suite = suites.get(self.suite)
+        needs = " --data DIR" if suite.needs else ""
+        return f"bufgym bench --suite {suite.source or suite.name} --policies {self.policy}{needs}"
 
 
-def made_of(spec: str) -> str:
-    """Hash of what a policy decides by: its functions with all that they call and read, and its settings.
+STATISTICS = (
+    *(bootstrap.interval, bootstrap.together, bootstrap.links_drawn, bootstrap.students_t.__wrapped__),
+    *(score.scores, score._Sample.of.__func__, score._Sample.sums, summarise),  # type: ignore[attr-defined]
+)
+"""Functions that make the intervals and shares of all pages; what they call counts, too."""
+_STAMP = re.compile(r"<!-- statistics (\S+) -->\n?")
+_BRACKETS = re.compile(r"\[[-+−]?\d*\.?\d+, [-+−]?\d*\.?\d+\]")
 
-    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare. A
-    policy that is not registered here has none.
-    """
-    try:
-        policy = policies.get(spec)
-    except BufgymError:
-        return ""
-    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send
-    fingerprints = [
-        fingerprint(getattr(function, "py_func", function)) for function in functions if function is not None
+
+def statistics() -> str:
+    """Hash of how intervals and shares are computed, of the kind of ``made_of``."""
+    parts = repr([fingerprint(function) for function in STATISTICS])
+    return f"{sys.implementation.cache_tag}-{hashlib.sha256(parts.encode()).hexdigest()[:12]}"
+
+
+def stamped(text: str) -> str:
+    """A page of results that was just made, with a comment at its end that says by which statistics."""
+    return f"{_STAMP.sub('', text).rstrip()}\n\n<!-- statistics {statistics()} -->\n"
+
+
+def statistics_of(text: str) -> str | None:
+    """By which statistics a page says it was made; ``UNKNOWN`` if it has intervals alone, None without any."""
+    found = _STAMP.search(text)
+    return found[1] if found else UNKNOWN if _BRACKETS.search(text) else None
+
+
+def stale_pages(pages: Mapping[Path, str]) -> list[Path]:
+    """Those pages, by their text, that say they were made by other statistics than today's, as far as they compare."""
+    here, now = f"{sys.implementation.cache_tag}-", statistics()
+    return [
+        page for page, text in pages.items() if (made := statistics_of(text) or "").startswith(here) and made != now
     ]
-    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are cached
-        fingerprints.append(cached.sources())
-    numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
-    digest = hashlib.sha256(repr((fingerprints, numbers)).encode()).hexdigest()
-    return f"{sys.implementation.cache_tag}-{digest[:12]}"
 
 
 def stale(board: Mapping[str, Entry]) -> list[str]:

@@ -4,7 +4,8 @@ A *cell* is a scenario with a capacity, and an *episode* of it is a trace with a
 episodes at every capacity of the scenario, so policies are compared episode by episode.
 
 Every interval is a paired bootstrap over links, and depends neither on the order of the rows nor on other policies
-(``bootstrap.links_drawn``, ``bootstrap.interval``). docs/guide/suites.md says what it describes,
+(``bootstrap.links_drawn``, ``bootstrap.interval``). That of an agent with several training seeds joins a bootstrap over
+these, drawn apart (``bootstrap.together``). docs/guide/suites.md says what it describes,
 and what *share of AFR's regret* and *mean ratio* are: each has one name everywhere.
 
 Interquartile mean and probability of improvement follow Agarwal et al. (NeurIPS 2021) and their library rliable.
@@ -15,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -22,16 +24,21 @@ from numpy.typing import NDArray
 
 from bufgym.benchmark import episodes
 from bufgym.benchmark.bootstrap import (
+    NOT_NEGATIVE,
     REALS,
     RESAMPLES,
     SEED,
+    SHARES,
     Interval,
-    interval,
+    Range,
     links_drawn,
     links_in,
+    places_of,
     ratio,
+    remark,
     stream,
     times_drawn,
+    together,
 )
 from bufgym.benchmark.episodes import Arrays, Cell, Numbers
 from bufgym.benchmark.table import NOBODY, RunRows, Unranked
@@ -41,7 +48,12 @@ REFERENCE = "afr"  # Policy that improvements and differences compare with; with
 
 DISCRIMINATIVE = 0.01  # A cell is discriminative, and counts, where the baseline's regret is at least this
 
-SHARES = 0.0, 1.0  # Bounds of probabilities and regrets
+AT_MOST_1: Range = (-math.inf, 1.0)
+RANGES: Mapping[str, Range] = {
+    **{"score": AT_MOST_1, "iqm": AT_MOST_1, "regret": SHARES, "improvement": SHARES, "share": NOT_NEGATIVE},
+    "qoi": NOT_NEGATIVE,
+}
+"""Range of each statistic; any other has none."""
 NEGLIGIBLE = 1e-9  # Mean regret up to which a ratio to it says nothing
 
 
@@ -92,6 +104,7 @@ class Scores:
 
     standings: list[Standing]  # ranked policies first, best score first
     cells: list[CellScore]  # by scenario, capacity, policy
+    remarks: tuple[str, ...] = ()  # on the sample of links
 
     @property
     def counted(self) -> int:
@@ -115,55 +128,94 @@ def scores(rows: RunRows, unranked: Unranked = NOBODY, against: str = "") -> Sco
     policy is compared with ``against`` by its share of ``REFERENCE``'s regret. See ``episodes.read`` for errors.
     """
     table = episodes.read(rows, BASELINE, against)
-    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
-    base = _resampled(table, BASELINE)
-    samples = {cell: _Sample.of(table, cell, base[cell], drawn[cell[0]]) for cell in table.cells}
-    discriminative = [cell for cell in table.cells if samples[cell].discriminative]
-    compared = _resampled(table, REFERENCE) if REFERENCE in table.training_seeds else {}
+    discriminative = [cell for cell in table.cells if _Sample.met(table, cell).discriminative]
+    several = {policy: len(seeds) for policy, seeds in table.training_seeds.items() if len(seeds) > 1}
+    by_links, *by_training = (_level(table, discriminative, trained, against) for trained in ("", *several))
+    levels = dict(zip(several, by_training, strict=True))
+
+    def joined(policy: str, key: str, links: int, cell: Cell | None = None) -> Interval:
+        on = [name for name in dict.fromkeys((policy, REFERENCE, against)) if name in several]
+        drawn = [(by_links.of(policy, key, cell), links)]
+        drawn += [(levels[name].of(policy, key, cell), several[name]) for name in on]
+        return together(drawn, RANGES.get(key, REALS))
+
     cell_scores: list[CellScore] = []
+    for policy, cell in product(table.training_seeds, table.cells):
+        met = table.episodes[cell[0]]
+        links = links_in({cell[0]: met})
+        of = {key: joined(policy, key, links, cell) for key in ("qoi", "score", "regret", "difference")}
+        counts, exact = cell in discriminative, table.exact[cell]
+        known = of["qoi"], of["score"], of["regret"], of["difference"]
+        cell_scores.append(CellScore(*cell, policy, len(met), *known, counts, exact))
+    links = links_in({scenario: table.episodes[scenario] for scenario, _ in discriminative})
+    standings = []
+    for policy, values in by_links.overall.items():
+        intervals = {key: joined(policy, key, links) for key in values}
+        standings.append(Standing(policy, unranked.get(policy, ""), intervals))
+    cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
+    standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
+    return Scores(standings, cell_scores, tuple(_remarks(table, discriminative)))
+
+
+def _remarks(table: Arrays, discriminative: Sequence[Cell]) -> list[str]:
+    """Remark on links that carry half of the reference's regret, where all scenarios have the same links."""
+    loser = REFERENCE if REFERENCE in table.training_seeds else BASELINE
+    losses = []
+    for cell in discriminative:
+        lost = (table.best[cell] - table.qoi[loser, cell].mean(axis=0)) / table.best[cell].sum()
+        losses.append(np.bincount(places_of(table.episodes[cell[0]]), lost))
+    if len({len(of_cell) for of_cell in losses}) != 1 or np.sum(losses) <= NEGLIGIBLE:
+        return []
+    traces = {trace for scenario, _ in discriminative for trace, _ in table.episodes[scenario]}
+    return remark(np.sum(losses, axis=0), loser, "links" if len(traces) > 1 else "episodes")
+
+
+class _Level(NamedTuple):
+    """Statistics of every policy, [1 + resamples] or, where nothing was drawn that they depend on, [1]."""
+
+    cells: Mapping[tuple[str, Cell], _Statistics]
+    overall: Mapping[str, dict[str, Numbers]]  # over the discriminative cells
+
+    def of(self, policy: str, key: str, cell: Cell | None) -> Numbers:
+        """One statistic in a cell, or over all."""
+        if cell is None:
+            return self.overall[policy][key]
+        numbers: Numbers = getattr(self.cells[policy, cell], key)
+        return numbers
+
+
+def _level(table: Arrays, discriminative: Sequence[Cell], trained: str, against: str) -> _Level:
+    """Draw the links, or the training seeds of the policy ``trained`` if it is one."""
+    once = {scenario: np.ones((1, len(met))) for scenario, met in table.episodes.items()}
+    drawn = once if trained else links_drawn(table.episodes, RESAMPLES, SEED)
+    h = {policy: _qoi(table, policy, policy == trained) for policy in table.training_seeds}
+    samples = {cell: _Sample.of(table, cell, h[BASELINE][cell], drawn[cell[0]]) for cell in table.cells}
+    compared = h.get(REFERENCE, {})
+    cells: dict[tuple[str, Cell], _Statistics] = {}
     overall: dict[str, dict[str, Numbers]] = {}
     for policy in table.training_seeds:
-        by_cell = {
-            cell: _statistics(h, compared.get(cell), samples[cell]) for cell, h in _resampled(table, policy).items()
-        }
-        if policy in table.unbounded:
-            for cell, s in by_cell.items():  # the clairvoyant's L does not bind it
-                none = {name: np.full_like(getattr(s, name), np.nan) for name in ("score", "regret", "by_trace")}
-                by_cell[cell] = s._replace(**none)
-        for cell, s in by_cell.items():
-            episodes_of = {cell[0]: table.episodes[cell[0]]}
-            drawn_links = links_in(episodes_of)
-            qoi, score, more = (interval(numbers, drawn_links) for numbers in (s.qoi, s.score, s.difference))
-            regrets = interval(s.regret, drawn_links, within=SHARES)
-            counts, exact = samples[cell].discriminative, table.exact[cell]
-            met = len(episodes_of[cell[0]])
-            cell_scores.append(CellScore(*cell, policy, met, qoi, score, regrets, more, counts, exact))
-        overall[policy] = _overall([by_cell[cell] for cell in discriminative], [samples[c] for c in discriminative])
+        for cell, qoi in h[policy].items():
+            found = _statistics(qoi, compared.get(cell), samples[cell])
+            if policy in table.unbounded:  # the clairvoyant's L does not bind it
+                none = {name: np.full_like(getattr(found, name), np.nan) for name in ("score", "regret", "by_trace")}
+                found = found._replace(**none)
+            cells[policy, cell] = found
+        overall[policy] = _overall([cells[policy, c] for c in discriminative], [samples[c] for c in discriminative])
     for values in overall.values():
         lost = overall[REFERENCE]["regret"] if REFERENCE in overall else np.full_like(values["regret"], np.nan)
         values["share"] = ratio(values["regret"], lost, lost > NEGLIGIBLE)
     for values in overall.values() if against else ():
         values["against"] = values["share"] - overall[against]["share"]
-    links = links_in({scenario: table.episodes[scenario] for scenario, _ in discriminative})
-    standings = []
-    for policy, values in overall.items():
-        found = {
-            key: interval(numbers, links, within=SHARES if key in ("improvement", "regret") else REALS)
-            for key, numbers in values.items()
-        }
-        standings.append(Standing(policy, unranked.get(policy, ""), found))
-    cell_scores.sort(key=lambda c: (c.scenario, c.capacity, c.policy))
-    standings.sort(key=lambda s: (not s.ranked, math.isnan(s["score"].value), -s["score"].value, s.policy))
-    return Scores(standings, cell_scores)
+    return _Level(cells, overall)
 
 
 @dataclass(frozen=True)
 class _Sample:
     """Drawn episodes of one cell, from which the statistics of every policy are computed."""
 
-    weights: Numbers  # number of draws of each episode, [1 + resamples, episodes]
+    weights: Numbers  # number of draws of each episode, [1 or 1 + resamples, episodes]
     starts: NDArray[np.intp]  # first episode of each trace, [traces]
-    base: Numbers  # sum of H of the baseline, [1 + resamples, traces]
+    base: Numbers  # sum of H of the baseline, [1 or 1 + resamples, traces]
     best: Numbers  # sum of H of the clairvoyant, same shape; NaN where unknown
 
     @classmethod
@@ -173,25 +225,31 @@ class _Sample:
         best = table.best[cell][np.newaxis]
         return cls(weights, starts, *(np.add.reduceat(weights * h, starts, axis=1) for h in (base, best)))
 
+    @classmethod
+    def met(cls, table: Arrays, cell: Cell) -> _Sample:
+        """The cell's own episodes, once each."""
+        base = table.qoi[BASELINE, cell].mean(axis=0, keepdims=True)
+        return cls.of(table, cell, base, np.ones((1, len(table.episodes[cell[0]]))))
+
     @property
     def discriminative(self) -> bool:
         """Whether the baseline loses enough."""
         return bool(regret(self.base[:1].sum(axis=1), self.best[:1].sum(axis=1))[0] >= DISCRIMINATIVE)
 
     def sums(self, h: Numbers) -> Numbers:
-        """Sum h[1 or 1 + resamples, episodes] over the drawn episodes, to [1 + resamples, traces]."""
+        """Sum h[1 or 1 + resamples, episodes] over the drawn episodes, to [1 or 1 + resamples, traces]."""
         return np.asarray(np.add.reduceat(self.weights * h, self.starts, axis=1))
 
 
 class _Statistics(NamedTuple):
-    """Statistics of one policy in one cell, [1 + resamples] each except ``by_trace``."""
+    """Statistics of one policy in one cell, [1 or 1 + resamples] each except ``by_trace``."""
 
     qoi: Numbers
     score: Numbers
     regret: Numbers
     difference: Numbers
     improvement: Numbers
-    by_trace: Numbers  # scores, [1 + resamples, traces]
+    by_trace: Numbers  # scores, [1 or 1 + resamples, traces]
 
 
 def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statistics:
@@ -209,7 +267,7 @@ def _statistics(h: Numbers, h_ref: Numbers | None, sample: _Sample) -> _Statisti
 
 
 def _overall(cells: Sequence[_Statistics], samples: Sequence[_Sample]) -> dict[str, Numbers]:
-    """Compute score, IQM, regret and improvement over the discriminative cells, [1 + resamples] each."""
+    """Compute score, IQM, regret and improvement over the discriminative cells."""
     if not cells:
         return dict.fromkeys(("score", "iqm", "regret", "improvement"), np.full(1, np.nan))
     values = np.hstack([cell.by_trace for cell in cells])
@@ -222,7 +280,7 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
     """Interquartile mean of each row of [n, tasks], a task counting ``weights`` times. Row 0 sets the share that is cut
     off at either end; NaN weighs nothing."""
     unknown = np.isnan(values)
-    values, weights = (np.where(unknown, 0.0, numbers) for numbers in (values, weights))
+    values, weights = (np.where(unknown, 0.0, numbers) for numbers in np.broadcast_arrays(values, weights))
     order = np.argsort(values, axis=1)
     values, weights = (np.take_along_axis(numbers, order, axis=1) for numbers in (values, weights))
     tasks = np.count_nonzero(weights[0])
@@ -234,13 +292,11 @@ def _interquartile_means(values: Numbers, weights: Numbers) -> Numbers:
     return ratio((kept * values).sum(axis=1), left, left > 0)
 
 
-def _resampled(table: Arrays, policy: str) -> dict[Cell, Numbers]:
-    """H of each episode by cell, [1, episodes], or its means over drawn training seeds, [1 + resamples, episodes].
+def _qoi(table: Arrays, policy: str, drawn: bool) -> dict[Cell, Numbers]:
+    """Mean H of each episode over training seeds by cell, [1, episodes], or over ``drawn`` ones, [1 + resamples, ...].
 
     A training seed is the same agent in every cell, so one draw serves all cells.
     """
-    trained = len(table.training_seeds[policy])
-    if trained == 1:
-        return {cell: table.qoi[policy, cell] for cell in table.cells}
-    weights = times_drawn(trained, RESAMPLES, stream(SEED, f"training of {policy}")) / trained
+    n = len(table.training_seeds[policy])
+    weights = times_drawn(n, RESAMPLES, stream(SEED, f"training of {policy}")) / n if drawn else np.full((1, n), 1 / n)
     return {cell: weights @ table.qoi[policy, cell] for cell in table.cells}

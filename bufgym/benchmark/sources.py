@@ -11,11 +11,14 @@ because names also come from other people's leaderboards and results.
 
 import hashlib
 import os
+import sys
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from pathlib import Path
 
 from bufgym import policies
+from bufgym.jit.fingerprint import fingerprint
+from bufgym.oracle import cached
 from bufgym.policies import Policy, registry
 from bufgym.policies.registry import OnArrival
 from bufgym.utils import modules
@@ -75,6 +78,47 @@ def loaded(names: Iterable[str], folder: str | None = None) -> tuple[str, ...]:
     """The sources in ``folder`` from which this process loaded policies of these names."""
     place, wanted = folder or os.getcwd(), {name.partition(":")[0] for name in names}
     return tuple(source for (home, source), name in _NAMES.items() if home == place and name in wanted)
+
+
+def made_of(spec: str | Policy) -> str:
+    """Hash of what a policy decides by: its functions with all that they call and read, and its settings.
+
+    The version of Python comes first, as its bytecode is part of the hash: only hashes of the same version compare. A
+    name that is not registered here has none.
+    """
+    try:
+        policy = policies.get(spec)
+    except BufgymError:
+        return ""
+    functions = policy.on_arrival, policy.on_departure, policy.on_dequeue, policy.on_send
+    fingerprints = [
+        fingerprint(getattr(function, "py_func", function)) for function in functions if function is not None
+    ]
+    owner = getattr(policy.on_arrival, "__self__", None)  # a model in torch, whose numbers are not in its functions
+    fingerprints += [] if owner is None else [owner.fingerprint]
+    if policy.privileged is not None:  # an oracle, by the texts of its files, as its plans are cached
+        fingerprints.append(cached.sources())
+    numbers = dict(policy.parameters), policy.weights, dict(policy.memory), policy.work, policy.client
+    digest = hashlib.sha256(repr((fingerprints, numbers)).encode()).hexdigest()
+    return f"{sys.implementation.cache_tag}-{digest[:12]}"
+
+
+def prepare(policy_file: str | None, sources: Iterable[str], home: str) -> None:
+    """Make policies of this file and these sources known in another process, once."""
+    if policy_file is not None and policy_file not in modules.FILES:
+        modules.run_file(policy_file, "--policy-file")
+    for source in sources:
+        load(source, home)
+
+
+def known_elsewhere(policy: Policy) -> bool:
+    """Whether other processes make the same policy of its name: a built-in one, or one that ``load`` has loaded."""
+    if not (policy.built_in or loaded([policy.name])):
+        return False
+    try:
+        return policies.get(policy.name) == policy
+    except BufgymError:
+        return False
 
 
 def digests(sources: Iterable[str], folder: str) -> dict[str, str]:

@@ -13,7 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bufgym.benchmark import episodes
-from bufgym.benchmark.bootstrap import RESAMPLES, SEED, UNKNOWN, Interval, interval, links_drawn, links_in, written
+from bufgym.benchmark.bootstrap import (
+    REALS,
+    RESAMPLES,
+    SEED,
+    UNKNOWN,
+    Interval,
+    Range,
+    interval,
+    links_drawn,
+    links_in,
+    written,
+)
 from bufgym.benchmark.episodes import Cell, Numbers
 from bufgym.benchmark.score import Scores, Standing
 from bufgym.benchmark.table import NOBODY, NONE, RunRows, Unranked, signed
@@ -32,6 +43,7 @@ class Quantity(NamedTuple):
     versus: str = ""  # policy that it compares with, which has no value itself
     total: bool = False  # whether it is summed over cells instead of averaged
     drawn: bool = False  # whether a report draws it beside the ranking
+    within: Range = REALS  # what its numbers, and so its intervals, cannot leave
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,7 @@ class Summary:
     """The same in each cell, cells in the order of the rows; empty where ``scores`` holds them."""
     baseline: str  # the policy that the others are measured against
     scores: Scores | None = None  # scores between the baseline and the clairvoyant, where one is known
-    notes: tuple[str, ...] = ()  # sentences about single policies, below the ranking
+    notes: tuple[str, ...] = ()  # sentences about single policies, or the links, below the ranking
 
     @property
     def standings(self) -> dict[str, Standing]:
@@ -127,7 +139,7 @@ def summarise(
             values = {}
             for quantity in quantities:
                 pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
-                values[quantity.key] = interval(pooled, links)
+                values[quantity.key] = interval(pooled, links, within=quantity.within)
             entries.append(Standing(policy, unranked.get(policy, ""), values))
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 

@@ -23,7 +23,6 @@ from typing import Any
 
 from bufgym import policies
 from bufgym.benchmark import cluster, folder, sources, tasks
-from bufgym.benchmark.cluster import BACKENDS
 from bufgym.benchmark.rows import Row, read_rows, write_rows
 from bufgym.benchmark.run import check_distinct, run
 from bufgym.benchmark.table import unranked_among
@@ -33,6 +32,7 @@ from bufgym.scenario import suites
 from bufgym.scenario.numbered import SEEDS_PER_TRACE, by_trace
 from bufgym.scenario.registry import with_parameters
 from bufgym.scenario.suites import Setting
+from bufgym.scenario.suites.own import MOST_SEEDS, fingerprint
 from bufgym.utils import __version__, modules
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import locked, write_text
@@ -60,9 +60,17 @@ class Sweep:
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Parameters of the scenarios that differ from the suite's, such as a client's ``window``."""
 
+    own: suites.Suite | None = None
+    """The suite where it is one's own, which other processes do not know by name; ``checked`` fills it in."""
+
+    @property
+    def frozen(self) -> suites.Suite:
+        """The suite."""
+        return self.own or suites.get(self.suite)
+
     @property
     def task(self) -> Task:
-        return tasks.task_of(self.suite)
+        return tasks.TASKS[self.frozen.kind]
 
     def __getstate__(self) -> dict[str, Any]:
         # A policy's functions may be of a module that only its file or source defines, so its name is pickled.
@@ -73,7 +81,7 @@ class Sweep:
         return [policies.get(spec) for spec in self.specs]
 
     def settings(self) -> dict[str, Setting]:
-        settings = suites.get(self.suite).settings(self.split, self.data)
+        settings = self.frozen.settings(self.split, self.data)
         if not self.changes:
             return settings
         return {
@@ -83,7 +91,7 @@ class Sweep:
 
     def capacities_of(self, setting: Setting) -> tuple[int, ...]:
         """L that a setting is met with: those asked for, or else its own or the suite's."""
-        own = self.capacities in ((), suites.get(self.suite).capacities)
+        own = self.capacities in ((), self.frozen.capacities)
         return setting.capacities if own and setting.capacities else self.capacities
 
     def setting(self, label: str, trace: int) -> Setting:
@@ -93,11 +101,12 @@ class Sweep:
 
     def checked(self) -> Sweep:
         """Fill in all defaults and check everything, so that errors come before any work."""
-        suite, task = suites.get(self.suite), self.task
+        suite, task = self.frozen, self.task
         self.settings()
         seeds = suite.seeds if self.seeds is None else self.seeds
-        if not 1 <= seeds <= SEEDS_PER_TRACE:
-            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {SEEDS_PER_TRACE}")
+        most = MOST_SEEDS if suite.own else SEEDS_PER_TRACE
+        if not 1 <= seeds <= most:
+            raise BufgymError(f"seeds = {seeds}: must lie between 1 and {most}")
         if any(L < 1 or self.capacities.count(L) > 1 for L in self.capacities):
             raise BufgymError(f"capacities = {list(self.capacities)}: must be whole numbers >= 1, no two alike")
         given, compared = self.policies, dict.fromkeys((task.baseline, task.reference))
@@ -105,8 +114,9 @@ class Sweep:
         specs = (*given, *(policies.get(name) for name in compared if name not in names))
         files = self.sources or sources.loaded(names, self.home)
         complete = replace(
-            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds
-        )
+            self, specs=specs, sources=files, capacities=self.capacities or suite.capacities, seeds=seeds,
+            own=suite if suite.own else None,
+        )  # fmt: skip
         check_distinct(complete.policies)
         for policy in complete.policies:
             task.check(policy)
@@ -117,7 +127,8 @@ class Sweep:
         shards = []
         for label, setting in self.settings().items():
             for trace in range(len(by_trace(setting.scenario))):
-                numbers = [SEEDS_PER_TRACE * trace + s for s in range(self.seeds or 0)]
+                first = SEEDS_PER_TRACE * trace + self.frozen.first_seeds.get(self.split, 0)
+                numbers = [first + s for s in range(self.seeds or 0)]
                 for k in range(0, len(numbers), _SEEDS_PER_SHARD):
                     shards.append(Shard(self, label, trace, tuple(numbers[k : k + _SEEDS_PER_SHARD])))
         return shards
@@ -143,10 +154,7 @@ _TRIES = 3  # worker deaths in a row, without a finished shard between them, tha
 def run_shard(shard: Shard) -> list[Row]:
     """Run one shard and return its rows. Each process runs the sweep's policy file once."""
     sweep = shard.sweep
-    if sweep.policy_file is not None and sweep.policy_file not in modules.FILES:
-        modules.run_file(sweep.policy_file, "--policy-file")
-    for source in sweep.sources:
-        sources.load(source, sweep.home)
+    sources.prepare(sweep.policy_file, sweep.sources, sweep.home)
     setting = sweep.setting(shard.label, shard.trace)
     limits: dict[str, Any] = {} if setting.max_bytes is None else {"max_bytes": setting.max_bytes}
     return run(sweep.policies, setting.scenario, sweep.capacities_of(setting), shard.seeds, label=shard.label, **limits)
@@ -188,10 +196,7 @@ def run_sweep(
     sweep = sweep.checked()
     if jobs is None:
         jobs = -1 if backend != "loky" or importlib.util.find_spec("joblib") else 1
-    if jobs < -1 or jobs == 0:
-        raise BufgymError(f"jobs = {jobs}: must be a whole number >= 1, or -1 for one a core")
-    if backend not in BACKENDS:
-        raise BufgymError(f"backend = {backend!r}: must be one of {', '.join(BACKENDS)}")
+    cluster.check(jobs, backend)
     layout = sweep.task.layout
     form = form or folder.form_of_rows(out)
     whole, parts = out / f"rows.{form}", out / "parts"
@@ -221,7 +226,7 @@ def run_sweep(
 
 
 def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, Any]:
-    suite, settings = suites.get(sweep.suite), sweep.settings()
+    suite, settings = sweep.frozen, sweep.settings()
     episodes = sum(len(shard.seeds) for shard in shards)
     code = sweep.policy_file and Path(sweep.policy_file).read_bytes()
     return {
@@ -241,12 +246,14 @@ def _manifest(sweep: Sweep, shards: Sequence[Shard], command: str) -> dict[str, 
         "changes": dict(sweep.changes),
         "policy_file": code and hashlib.sha256(code).hexdigest()[:16],
         "sources": sources.digests(sweep.sources, sweep.home) or None,
+        "made_of": {p.name: sources.made_of(p) for p in sweep.policies if not sources.known_elsewhere(p)} or None,
         "scenarios": {
             label: {
                 "about": setting.about,
                 "value": setting.scenario.value.name,
                 **({} if setting.outage_s is None else {"outage_s": setting.outage_s}),
                 **({"recordings": _fingerprint(setting.scenario)} if suite.needs else {}),
+                **({"episodes": fingerprint(setting.scenario)} if suite.own else {}),
             }
             for label, setting in settings.items()
         },

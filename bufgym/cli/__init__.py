@@ -18,7 +18,7 @@ from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandErr
 
 from bufgym.cli.options import OPTIONS
 from bufgym.utils import __version__, modules, packages
-from bufgym.utils.errors import BufgymError, TraceWarning, printable
+from bufgym.utils.errors import BufgymError, TraceWarning, printable, unknown
 
 __all__ = ["app", "main"]
 
@@ -32,6 +32,7 @@ COMMANDS: dict[str, Any] = {
     "report": "bufgym.cli.results:report",
     "leaderboard": "bufgym.cli.results:leaderboard",
     "validate": "bufgym.cli.results:validate",
+    "curves": "bufgym.cli.results:curves",
     "trace": (
         "Bandwidth traces and recordings: look at them, convert, fit, generate, fetch.",
         {
@@ -86,6 +87,8 @@ def _unknown(error: CycloptsError, command: str) -> str:
     """What is unknown; if a program or a package that is not installed has it, how to get that."""
     if command == "train":
         return 'train is a program of bufgym\'s source tree: type there "make train", or "python train.py --help"'
+    if command.startswith("-"):
+        return str(unknown("option", command, ["--version", "--help"]))
     message = packages.absent(GROUP, entry_points(group=GROUP).names).get(command)
     if message is None:
         return str(error)

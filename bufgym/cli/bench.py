@@ -98,7 +98,7 @@ def bench(
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
         experiment = _on_suite(suite, who, given(shared), command)
     else:
-        refuse(given(suite), "needs --suite")
+        refuse(given(suite, "split", "data"), "needs --suite")
         if drops is not None and workload.workload is None:
             raise BufgymError("--drops needs --workload")
         if mcap is not None and (workload.workload is None or mcap.suffix != ".mcap"):
@@ -106,6 +106,8 @@ def bench(
         if mcap is not None and not all(map(is_recording, workload.workload or [])):
             raise BufgymError(f"--mcap {mcap}: needs a recording that holds the messages themselves (MCAP, ROS bag)")
         experiment = _on_scenario(options, buffer, who.seeds)
+        processes = given(suite, "jobs", "backend", "address")
+        experiment.arguments.update(processes, **({"policy_file": who.policy_file} if who.policy_file else {}))
     entrants, rival = who.entrants(experiment.task), who.rival()
     topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
     file, folder, page = out.file(), out.folder(), out.page()
@@ -166,8 +168,9 @@ def _command(
 
 def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], command: str) -> Experiment:
     from bufgym.benchmark.tasks import task_of
+    from bufgym.scenario import suites
 
-    name = suite.suite or ""
+    name = suites.named(suite.suite or "")
     arguments = {name: value for name, value in given(suite).items() if name != "suite"}
     arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "changes": changes, "command": command}
     return Experiment(name, task_of(name), arguments)
@@ -288,7 +291,7 @@ def fleet(
 def _suite_of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
     from bufgym.scenario import suites
 
-    suite = suites.get(options.suite or default)
+    suite = suites.get(suites.named(options.suite or default))
     if suite.kind != kind:
         raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
-    return replace(options, suite=suite.name)
+    return replace(options, suite=suite.source or suite.name)

@@ -69,6 +69,7 @@ Seeds = Annotated[
     int, checked(int, lambda number: 1 <= number <= MAX_EPISODES, f"a whole number >= 1 and at most {MAX_EPISODES}")
 ]
 Positive = Annotated[float, checked(float, lambda number: 0 < number < math.inf, "a number > 0")]
+PerSecond = Annotated[float, checked(float, lambda rate: 0.01 <= rate <= 1000, "a number from 0.01 to 1000")]
 Least0 = Annotated[float, checked(float, lambda number: 0 <= number < math.inf, "a number >= 0")]
 Capacities = Annotated[
     tuple[int, ...],
@@ -91,14 +92,14 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1); --out DIR keeps
-    it, a second call resumes it."""
+    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1), or module:NAME, your own
+    bufgym.suite(...), whose code is run; --out DIR keeps it, a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
     """Folder of recordings, for suites over real links."""
     jobs: Whole | None = None
-    """Processes side by side (default: one a core)."""
+    """Processes side by side, -1 for one a core (default: a suite one a core, any other one)."""
     backend: str | None = None
     """loky (default), threading, sequential, ray or dask."""
     address: str | None = None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.cli.listing import environments
-from bufgym.cli.options import Count, Least0, Natural, PolicyFile, one_policy
+from bufgym.cli.options import Count, Natural, PerSecond, PolicyFile, one_policy
 from bufgym.utils.errors import BufgymError, unknown
 from bufgym.utils.files import replaced
 from bufgym.utils.libraries import library
@@ -21,7 +21,7 @@ def play(
     env: str = "Uplink-v0",
     capacity: Count = 8,
     seed: Natural = 0,
-    speed: Least0 = 5.0,
+    speed: PerSecond = 5.0,
     steps: Count = 200,
     out: Path | None = None,
     policy_file: PolicyFile = None,
@@ -33,7 +33,7 @@ def play(
         env: Environment.
         capacity: L, messages.
         seed: The episode of this seed in bench.
-        speed: Decisions a second; 0: no pause.
+        speed: Decisions a second.
         steps: Stop after so many decisions.
         out: Write a film in place (.gif, .webp, .png).
     """
@@ -72,7 +72,7 @@ def play(
     end = f"stopped after {steps} decisions (--steps)"
     for step in range(steps):
         show(f"{clear}{policy.name}, decision {step + 1}\n")
-        if speed and film is None:
+        if film is None:
             time.sleep(1 / speed)
         # An episode that asks for no decision ends with its first step, whatever the action.
         due = world.sub_envs.senders.batch.senders[0]["waiting"] != 0
@@ -87,6 +87,6 @@ def play(
         from PIL import Image  # comes with matplotlib, which drew them
 
         first, *others = map(Image.fromarray, film)
-        with replaced(out) as temporary:  # 10 images a second where there is no pause
-            first.save(temporary, FILMS[out.suffix], save_all=True, append_images=others, duration=1000 / (speed or 10))
+        with replaced(out) as temporary:
+            first.save(temporary, FILMS[out.suffix], save_all=True, append_images=others, duration=1000 / speed)
         print(f"wrote {out} ({len(film)} pictures)")

@@ -142,6 +142,8 @@ class ObservationForm:
         for field, first, entries in self.places:
             low[first : first + entries], high[first : first + entries] = field.low, field.high
         self.mask, space = mask, _space(self.of(low), self.of(high))
+        if form == "flat":  # numbers have no names, so the space has them, and takes them into a model's file
+            space.fields = {place.field.name: place.entries for place in self.places}
         self.space: Any = space if mask is None else mask.space(space, actions or capacity + 2)
 
     def masked(self, observation: Observation, mask: NDArray[np.int8]) -> Observation:
@@ -164,6 +166,14 @@ class ObservationForm:
         slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
         parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
         return {name: part for name, part in parts.items() if part.size}
+
+
+def fields_of(space: Any) -> dict[str, int] | None:
+    """The fields that a space names, "dict" or "flat", with the count of each one's numbers; None if it names none."""
+    if isinstance(space, spaces.Dict):
+        slots = {"slots", "context"} & set(space)
+        return None if slots else {name: spaces.flatdim(part) for name, part in space.items()}
+    return getattr(space, "fields", None)
 
 
 def _firsts(fields: Iterable[Field], widths: Mapping[str, int]) -> Iterator[int]:

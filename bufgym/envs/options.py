@@ -5,11 +5,10 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 
 from bufgym import scenario as scenarios
 from bufgym.envs.observation import MaskKeys
-from bufgym.model.checks import above_0, whole
+from bufgym.model.checks import above_0, flag, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 CANDIDATES, SLOTS = "candidates", "slots"
 ACTIONS = (CANDIDATES, SLOTS)  # What an action is: the candidate or the slot that goes
 INFOS = ("full", "summary", "mask", "none")
-"""How much ``info`` has: all, all plus the summary so far (the same entries in every step), the action mask alone, or
-nothing. At an episode's end the summary is always there."""
 RENDER_MODES = ("ansi", "rgb_array", "human")
 MASK_KEYS = {
     "rllib": ("observations", "action_mask"),
@@ -41,31 +38,59 @@ class InvalidActionError(BufgymError, gym.error.InvalidAction):
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """An environment's options beside its scenario. ``SenderEnv`` says what each of them means.
+    """An environment's options beside its scenario.
 
-    A new option is a field here, with its check below, and a line in the docstring of ``SenderEnv``. Values that belong
-    to one part of an environment are checked where that part is made: the queue's in ``Senders``, the fields' in
-    ``ObservationForm``, the reward's in ``reward_weights``.
+    A new option is a field here, with its meaning and its check. Values that belong to one part of an environment are
+    checked where that part is made: the queue's in ``Senders``, the fields' in ``ObservationForm``, the reward's in
+    ``reward_weights``.
     """
 
     capacity: int = 8
+    """L, messages."""
     max_bytes: int | None = None
+    """B, bytes; None for no limit."""
     decide_at: str | None = None
+    """When to ask: "overflow" only when the buffer is full, the default of candidates; "arrival" at every arrival, the
+    default of slots."""
     reward: str | Mapping[str, float] = "retained"
+    """A term's name, or weights by name; terms outside ``REWARD_TERMS`` take part only if named."""
     reference: str | Policy = "min-motion-gap"
+    """The rule of ``paired``, a compiled policy or its name; "min-motion-gap" always drops the cheapest."""
     reward_scale: float | str | None = None
+    """Factor on the reward, None for 1. "episode" is the constant ``reward_scale`` of the scenario's class, which
+    brings a rule's return in a default episode between 1 and 10; weights of your own terms stay as they are.
+    ``info["reward_terms"]`` is not scaled."""
     actions: str = CANDIDATES
+    """What an action is: "candidates", for one queue, or "slots", the only one of several topics."""
     candidates: int = 2
+    """How many of the cheapest candidates are actions beside the head, 1 to 64."""
     repeat: int = 1
+    """An action holds for so many decisions. At each of them its place in the order of candidates is looked up anew.
+    Rewards add up over them, and an episode's end cuts them short. For candidates."""
     fields: str | Sequence[str] | None = None
+    """With candidates, names of fields to observe beside the 27 numbers, your own or those of ``ON_BOARD_FIELDS``. With
+    slots, names of the fields to observe, by default all of the tables; "compact" means all of the context's."""
     observation: str | None = None
+    """Form: "flat", the default of candidates; "dict", the default of slots; or "slots"."""
     info: str = "full"
+    """How much ``info`` has: "full"; "summary" adds the summary so far in every step, for recorders; "mask" has the
+    mask alone, and at an episode's end its summary; "none" has only this summary."""
     bound: bool = False
+    """Whether the last ``info`` also has ``clairvoyant``, ``certified``, ``regret`` and ``score``, for one queue."""
     pool: int | None = None
+    """Take every episode from a fixed set of so many, a ``bufgym.scenario.numbered.Pool`` that is the same for every
+    seed; None to draw a new one at each reset."""
     num_threads: int = 1
+    """Threads that share the environments of a batch; they do not change results."""
     render_mode: str | None = None
+    """Drawing: "ansi", "rgb_array", or "human" for a window that shows each step (extra ``human``)."""
     mask_in_observation: bool | str | Sequence[str] = False
+    """Whether observations hold the action mask. True puts ``action_mask`` beside the fields. Two names, or the library
+    they belong to, make a nested dict: "rllib" (``observations``, ``action_mask``), "tianshou" (``obs``, ``mask``),
+    "pettingzoo" (``observation``, ``action_mask``). A "flat" observation is always nested, by True as by "pettingzoo".
+    """
     mask_dtype: str = "int8"
+    """Type "int8" or "bool" of the mask in observations; in ``info`` it is int8, which Gymnasium samples by."""
 
     def __post_init__(self) -> None:
         for name, known in _CHOICES.items():
@@ -83,8 +108,7 @@ class Options:
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
             raise BufgymError(f"fields = {names!r}: must be a list of names or 'compact'")
-        if not isinstance(self.bound, bool | np.bool_):
-            raise BufgymError(f"bound = {self.bound!r}: must be True or False")
+        flag("bound", self.bound)
         whole("num_threads", self.num_threads, 1)
 
     def window(self) -> "Window | None":

@@ -5,7 +5,7 @@
 
 import math
 import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,8 +49,10 @@ NUMBERED = ("scenario", "trace", "seed")
 """Options that name an episode of a benchmark; see ``bufgym.scenario.numbered``."""
 
 
-def check_entries(names: Iterable[str], known: Sequence[str], place: str) -> None:
-    """Check that all ``names`` of entries are ``known``; errors call what has them ``place``."""
+def check_entries(names: Mapping[str, Any], known: Sequence[str], place: str) -> None:
+    """Check that ``names`` is a dict of ``known`` entries alone; errors call it ``place``."""
+    if not isinstance(names, Mapping):
+        raise BufgymError(f"{place} = {names!r}: must be a dict of {', '.join(known)}")
     for name in names:
         if name not in known:
             raise unknown("entry", name, known, place=place)
@@ -253,7 +255,7 @@ class SubEnvs:
         }
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
-        """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``INFOS``."""
+        """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``Options.info``."""
         info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
         if self.choices is not None and self._shows_mask:
             info["slots"] = self.output.slot_actions[i].copy()

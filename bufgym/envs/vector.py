@@ -101,7 +101,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        options = options or {}
+        options = {} if options is None else options
         check_entries(options, ("reset_mask", "episodes"), "options")
         seeds = [None] * self.num_envs if seed is None else seed
         if isinstance(seeds, int | np.integer):

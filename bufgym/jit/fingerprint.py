@@ -58,7 +58,8 @@ def _read(function: FunctionType, names: list[str]) -> Iterator[tuple[str, Any]]
         yield name, value
         # Modules may import each other in a circle; no kernel reads deeper than a.b.c.d.
         if isinstance(value, ModuleType) and name.count(".") < 4:
-            waiting += [(f"{name}.{part}", getattr(value, part)) for part in names if hasattr(value, part)]
+            held = vars(value)
+            waiting += [(f"{name}.{part}", held[part]) for part in names if part in held]
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         yield name, cell.cell_contents
     yield "defaults", (function.__defaults__, tuple(sorted((function.__kwdefaults__ or {}).items())))

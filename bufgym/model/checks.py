@@ -43,6 +43,12 @@ def whole(name: str, number: Any, least: int = 0, most: int | None = None, *, sy
     return int(number)
 
 
+def flag(name: str, given: Any) -> None:
+    """Check that ``given`` is True or False; a number is neither."""
+    if not isinstance(given, bool | np.bool_):
+        raise BufgymError(f"{name} = {given!r}: must be True or False")
+
+
 def check_window(window: Any) -> int:
     """Check n_T, the most messages sent and not yet acked."""
     return whole("window", window, 1, MAX_WINDOW, symbol="n_T")

@@ -11,7 +11,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch import nn
 
-from bufgym.envs.observation import ObservationForm
+from bufgym.envs.observation import ObservationForm, fields_of
 from bufgym.envs.own import write_in_python
 from bufgym.model.buffer import ACCEPT, Buffer, has_space
 from bufgym.model.observe import (
@@ -27,7 +27,7 @@ from bufgym.model.observe import (
 )
 from bufgym.policies.candidate_network import CandidateWeights, inputs
 from bufgym.policies.weights import MAX_WIDTH
-from bufgym.sb3.networks import array, takes_masks
+from bufgym.sb3.networks import array, fingerprint_of, takes_masks
 from bufgym.utils.errors import BufgymError
 
 _FIRST = CANDIDATE_FIELDS[0].name
@@ -37,18 +37,20 @@ _ACTIVATIONS = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 def candidates_of(agent: Any) -> int | None:
     """k, if the model observes k candidates and the head, otherwise None."""
     space, actions = agent.observation_space, int(getattr(agent.action_space, "n", 0))
-    names = set(space) if isinstance(space, spaces.Dict) else set()
     for k in (actions - 1, actions - 2):
-        if k < 1:
-            continue
-        if names:
-            if "slots" in names and space["slots"].shape == (k + 1, len(CANDIDATE_FIELDS)):
-                return k
-            if _FIRST in names and space[_FIRST].shape == (k + 1,):
-                return k
-        elif space == _form("flat", k).space:
+        if k >= 1 and _observes(space, k):
             return k
     return None
+
+
+def _observes(space: Any, candidates: int) -> bool:
+    """Whether the space is one of so many candidates and the head."""
+    fields = fields_of(space)
+    if fields is not None:
+        return fields.get(_FIRST) == candidates + 1
+    if isinstance(space, spaces.Dict):
+        return "slots" in set(space) and space["slots"].shape == (candidates + 1, len(CANDIDATE_FIELDS))
+    return bool(space == _form("flat", candidates).space)
 
 
 def _form(form: str, candidates: int, capacity: int = 1, names: list[str] | None = None) -> ObservationForm:
@@ -71,6 +73,8 @@ def perceptron(policy: Any, candidates: int) -> CandidateWeights | None:
     widths = [layer.out_features for layer in linear[:-1]]
     if len(widths) > CandidateWeights.LAYERS or max(widths, default=0) > MAX_WIDTH:
         return None
+    if linear[0].in_features != inputs(candidates):  # it observes fields by name, too
+        return None
     numbers = tuple((array(layer.weight).T.copy(), array(layer.bias)) for layer in linear)
     at_arrivals = int(policy.action_space.n) == candidates + 2
     return CandidateWeights(candidates, at_arrivals, takes_masks(policy), _ACTIVATIONS[kinds.pop()], numbers)
@@ -81,20 +85,21 @@ class CandidateDecisions:
 
     def __init__(self, name: str, agent: Any, candidates: int, masked: bool) -> None:
         self.name, self.agent, self.candidates, self.masked = name, agent, candidates, masked
+        self.fingerprint = fingerprint_of(agent)
         self.at_arrivals = int(agent.action_space.n) == candidates + 2
         space = agent.observation_space
-        form, names = "flat", None
+        form = "flat" if not isinstance(space, spaces.Dict) else "slots" if "slots" in set(space) else "dict"
+        fields = fields_of(space)
+        names = None if fields is None else list(fields)
+        known = {field.name for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)}
         self.capacity: int | None = None
         """L that the model was trained for; None if it serves every L."""
-        if isinstance(space, spaces.Dict):
-            form, names = ("slots", None) if "slots" in set(space) else ("dict", list(space))
-        known = {field.name for field in (*CANDIDATE_FIELDS, *QUEUE_FIELDS)}
-        for key in names or ():
+        for key, numbers in (fields or {}).items():
             field = BUILT_IN.get(key) or own_field(key)
             if key not in known and field is None:
                 raise BufgymError(f"model {name}: observes {key!r}, which is no field (bufgym list observations)")
             if field is not None and field.per == "slot":
-                self.capacity = space[key].shape[0] - 1
+                self.capacity = numbers - 1
         self.form = _form(form, candidates, self.capacity or 1, names)
         if self.form.space != space:
             rule = f"must be the {inputs(candidates)} of {candidates} candidates and the head, and fields by name"

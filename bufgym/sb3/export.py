@@ -84,8 +84,8 @@ def weights_of(model: Any) -> Weights | CandidateWeights:
         if found is None:
             raise BufgymError(
                 f'only networks of PPO, A2C, MaskablePPO or DQN with "MlpPolicy" and at most {CandidateWeights.LAYERS} '
-                f"hidden layers of {MAX_WIDTH} units, tanh or relu, can be exported among candidates, and "
-                f"{type(policy).__name__} is another; as_policy runs it in torch"
+                f"hidden layers of {MAX_WIDTH} units, tanh or relu, that observe no fields by name, can be exported "
+                f"among candidates, and {type(policy).__name__} is another; as_policy runs it in torch"
             )
         return found
     features, scorer = (getattr(policy, part, None) for part in ("features_extractor", "mlp_extractor"))

@@ -4,6 +4,7 @@ Scoring slots one by one builds knowledge of the problem in. A message's worth d
 features) and on the link (the context), not on the number of its slot. One set of weights serves every L.
 """
 
+import hashlib
 import inspect
 from typing import Any
 
@@ -148,3 +149,12 @@ class SlotPolicy(MaskableMultiInputActorCriticPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return super()._get_constructor_parameters() | {"width": self.width, "masked": self.masked}
+
+
+def fingerprint_of(agent: Any) -> str:
+    """A hash of a model's numbers and of their names."""
+    network = getattr(agent, "policy", agent)
+    digest = hashlib.sha256()
+    for name, tensor in network.state_dict().items():
+        digest.update(f"{name}{list(tensor.shape)}".encode() + array(tensor).tobytes())
+    return digest.hexdigest()

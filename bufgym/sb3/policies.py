@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from bufgym.envs.observation import ObservationForm
+from bufgym.envs.observation import ObservationForm, fields_of
 from bufgym.envs.own import write_in_python
 from bufgym.model import observe
 from bufgym.model.buffer import ACCEPT, HOLD, REJECT, Buffer, is_first
@@ -19,7 +19,7 @@ from bufgym.policies.schedulers import fits, makes_room
 from bufgym.policies.weights import StrPath
 from bufgym.sb3.candidates import CandidateDecisions, candidates_of, perceptron
 from bufgym.sb3.export import read_policy, refuse_normalized, weights_of
-from bufgym.sb3.networks import SlotScorer, takes_masks
+from bufgym.sb3.networks import SlotScorer, fingerprint_of, takes_masks
 from bufgym.utils.errors import BufgymError
 
 
@@ -30,7 +30,8 @@ def as_policy(model: BaseAlgorithm | BasePolicy | StrPath, name: str = "") -> Po
     candidates, "flat", and a network that scores slots with masks (``SlotPolicy`` under MaskablePPO). Any other network
     runs in torch, one decision at a time. It serves every L if it observes candidates, and otherwise the L it was
     trained for. Algorithms that take action masks get them. For others, an invalid action does the same as in
-    the environment. An observation "flat" or "slots" must be of every field; a "dict" names its fields.
+    the environment. An observation "slots" must be of every field; the space of a "dict" or "flat" one has the names
+    of its fields, which a wrapper that makes a space of its own loses.
 
         policy = as_policy("model.zip", "mine")
         bufgym.benchmark.run.run([policy, policies.get("afr")], scenario, capacities=[8], seeds=10)
@@ -73,6 +74,7 @@ class _Decisions:
 
     def __init__(self, name: str, agent: Any, masked: bool) -> None:
         self.name, self.agent, self.masked = name, agent, masked
+        self.fingerprint = fingerprint_of(agent)
         space, actions = agent.observation_space, agent.action_space
         self.capacity = int(getattr(actions, "n", 0)) - 2
         if self.capacity < 1:
@@ -81,7 +83,8 @@ class _Decisions:
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
         if form == "dict" and {"slots", "context"} & set(space):
             form = "slots"
-        names, numbers = list(space) if form == "dict" else None, spaces.flatdim(space)
+        fields, numbers = fields_of(space), spaces.flatdim(space)
+        names = None if fields is None else list(fields)
         all_fields = (
             observe.SLOT_FIELDS + observe.TOPIC_SLOT_FIELDS,
             observe.CONTEXT_FIELDS + observe.TOPIC_CONTEXT_FIELDS,
@@ -104,7 +107,7 @@ class _Decisions:
             rule = f"must be the {expected} of {', '.join(names or known)} for L = {self.capacity}"
             if form == "flat":
                 known_sizes = " or ".join(str(candidate_network.inputs(k)) for k in (self.capacity, self.capacity + 1))
-                rule += f'; of candidates {known_sizes}, and further fields by name (observation="dict")'
+                rule += f"; of candidates {known_sizes}, and further fields where the space has their names"
             raise BufgymError(f"model {name}: observes {numbers} numbers: {rule}")
 
     def on_arrival(self, buffer: Buffer, arrival: Any, memory: NDArray[np.float64]) -> int:

@@ -53,7 +53,7 @@ def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scen
         if scenario is not None:
             raise BufgymError(f"scenario = {scenario!r}: only the episodes of a suite have one")
         part = _part(family, trace)
-        return draw(part, whole("seed", seed))
+        return draw(part, _seed(seed))
     if scenario is None:
         labels = dict.fromkeys(label for member in members.values() for label, _ in by_trace(member))
         if isinstance(trace, str) and trace not in labels:
@@ -61,8 +61,15 @@ def numbered(family: Any, seed: Any = None, trace: str | int | None = None, scen
         raise BufgymError(f"scenario: missing; a suite's row has one besides its seed: one of {', '.join(members)}")
     if scenario not in members:
         raise BufgymError(f"scenario = {scenario!r}: must be one of {', '.join(members)}")
-    member, seed = members[scenario], whole("seed", seed)
+    member, seed = members[scenario], _seed(seed)
     return draw(_part(member, seed // SEEDS_PER_TRACE if trace is None else trace), seed).valued(member.value)
+
+
+def _seed(given: Any) -> int:
+    if given is None:
+        rule = "it names a row, as in options={'trace': 0, 'seed': 4}; that of reset(seed=4) is for what is drawn"
+        raise BufgymError(f"options: no seed: {rule}")
+    return whole("seed", given)
 
 
 def _part(scenario: Any, trace: str | int | None) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bufgym import traces
 from bufgym.model import qoi
-from bufgym.model.checks import whole
+from bufgym.model.checks import flag, whole
 from bufgym.model.link import MAX_TIME_US, Link
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
@@ -92,6 +92,8 @@ class Uplink:
         if not self.scale or not all(math.isfinite(s) and s > 0 for s in self.scale):
             raise BufgymError(f"scale = {self.scale}: every factor must be a number > 0")
         check_stream(self)
+        flag("tells_duration", self.tells_duration)
+        flag("random_offset", self.random_offset)
         check_sizes(self, bool(self.motion) or self.workload is not None)
         up_to("duration_s", self.duration_s, MAX_DURATION_S)
         whole("propagation_us", self.propagation_us, 0, MAX_TIME_US)

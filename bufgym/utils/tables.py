@@ -41,13 +41,35 @@ class Table(NamedTuple):
         notes = [f"<p>{html.escape(note)}</p>" for note in self.notes if note]
         return "\n".join(["<table>", self._row("th", self.head), *body, "</table>", *notes])
 
-    def forms(self) -> list[str]:
-        return [self.plain(), self.markdown(), self.html()]
+    def latex(self) -> str:
+        """A ``tabular`` of all blocks for LaTeX's package booktabs; the notes are comments behind it."""
+        lines = [" & ".join(map(_latex, line)) + r" \\" for line in (self.head, *self.lines)]
+        sides = "l" * self.left + "r" * (len(self.head) - self.left)
+        out = [rf"\begin{{tabular}}{{{sides}}}", r"\toprule", lines[0], r"\midrule", *lines[1:]]
+        notes = [f"% {printable(note)}" for note in self.notes if note]
+        return "\n".join([*out, r"\bottomrule", r"\end{tabular}", *notes])
+
+    def forms(self) -> dict[str, str]:
+        """The table in each form, by name."""
+        return {"plain": self.plain(), "markdown": self.markdown(), "html": self.html(), "latex": self.latex()}
 
     def _row(self, tag: str, line: Sequence[str]) -> str:
         sides = ["left" if k < self.left else "right" for k in range(len(line))]
         cells = zip(sides, map(html.escape, map(printable, line)), strict=True)
         return "<tr>" + "".join(f'<{tag} style="text-align: {side}">{cell}</{tag}>' for side, cell in cells) + "</tr>"
+
+
+_LATEX = {
+    **{c: f"\\{c}" for c in "&%$#_{}"},
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"<": "$<$", ">": "$>$", "\N{MINUS SIGN}": "$-$", "\N{EN DASH}": "--"},
+}
+
+
+def _latex(cell: str) -> str:
+    """A cell as LaTeX shows it; a bracket at its beginning would be read as an argument of the line before."""
+    text = "".join(_LATEX.get(c, c) for c in printable(cell))
+    return f"{{}}{text}" if text.startswith("[") else text
 
 
 def aligned(lines: Sequence[Sequence[object]], left: int = 1) -> list[str]:

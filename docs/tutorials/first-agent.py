@@ -54,8 +54,7 @@ compared = bufgym.compare([mine, "learned", "afr", "drop-oldest"], Interruption(
 print(compared)
 
 # %% [markdown]
-# The agent is trained for seconds only. `make train` trains longer, and the [guide](../guide/training.md) says how the
-# shipped agents were made.
+# The agent is trained for seconds only. [Training](../guide/training.md) goes on from here.
 #
 # ## The picture
 

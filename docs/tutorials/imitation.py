@@ -95,9 +95,8 @@ compared = bufgym.compare([mine, "min-motion-gap", "afr", "drop-oldest"], "lte",
 print(compared)
 
 # %% [markdown]
-# The pupil is above AFR, and far below 1, the clairvoyant's score. Where the link decides only later which message was
-# worth keeping, equal states have different labels, and the pupil learns their mean. `examples/imitation.py` trains
-# longer; the [guide](../guide/experts.md#experts) has more about experts.
+# The pupil is above AFR, and far below 1, the clairvoyant's score: [the guide](../guide/experts.md#experts) says why.
+# `examples/imitation.py` trains longer.
 #
 # ## The picture
 

@@ -45,7 +45,7 @@ bufgym([*command.split(), "--seeds", "40", "--capacity", "20", "--jobs", "1", "-
 # ## The row
 #
 # `mine/rows` holds a row for each episode and policy, and a manifest that says how they were made. A leaderboard entry
-# sums them up: the score is 0 for Drop Oldest and 1 for the clairvoyant, with an interval over episodes.
+# sums them up, with an [interval](../guide/suites.md#intervals-and-shares) over episodes.
 
 # %%
 from bufgym.benchmark import leaderboard

@@ -22,8 +22,8 @@ def every_second(buffer, arrival, memory):
 
 
 # %% [markdown]
-# `memory` is the policy's own state, fresh for each episode. Settings go into `parameters={"name": number}` and are
-# read as `buffer.parameters`. With `compile=True` the same function runs compiled.
+# `memory` is the policy's own state, fresh for each episode. [The guide](../guide/own-policy.md) has all that a policy
+# may see, and its settings.
 #
 # ## Against the others
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -37,7 +38,7 @@ def contents(folder: Path) -> dict[str, tuple[bytes, int]]:
     return {str(path.relative_to(folder)): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
 
 
-def interrupt(*_: object) -> None:
+def interrupt(*_: object) -> NoReturn:
     """Ctrl-C in the middle of what it takes the place of."""
     raise KeyboardInterrupt
 

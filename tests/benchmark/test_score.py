@@ -217,13 +217,19 @@ def test_training_seeds_widen_the_interval(monkeypatch: pytest.MonkeyPatch) -> N
     agent, afr = standing_of(made, "agent"), standing_of(made, "afr")
     assert agent["score"].value == pytest.approx(afr["score"].value)
     assert agent["improvement"].value == 0.5
-    # The mean of three draws of 1/4, 1/2, 3/4 has a standard deviation of .25 sqrt(2/3) / sqrt(3) = .118.
-    assert agent["score"][1:] == pytest.approx((0.5 - 1.98 * 0.118, 0.5 + 1.98 * 0.118), abs=0.03)
+    # 1/4, 1/2, 3/4 have a standard deviation of 1/4, so their mean .144; Student's t, 2 degrees of freedom, is 4.303.
+    # The links' own reach, that of AFR, adds as a square. A score ends at 1.
+    low = 0.5 - math.hypot(4.303 * 0.25 / math.sqrt(3), 0.5 - afr["score"].low)
+    assert agent["score"][1:] == pytest.approx((low, 1), abs=0.02)
     assert width(agent["score"]) > 5 * width(afr["score"])
     assert width(agent["improvement"]) == 1
     # One training seed is nothing to draw from, and a policy's own rows are not touched by others'.
     single = [dict(row, training_seed=7) if row["policy"] == "afr" else row for row in rows_of(**cell)]
     assert standing_of(score.scores(single), "afr") == standing_of(score.scores(rows_of(**cell)), "afr") == afr
+    # A difference to another policy is drawn by the same trainings: to itself it is 0.
+    against = score.scores(rows, against="agent")
+    assert standing_of(against, "agent")["against"] == (0, 0, 0)
+    assert width(standing_of(against, "afr")["against"]) > 3 * width(standing_of(against, "afr")["score"])
     # As a reference, the agent is its own equal in every draw.
     monkeypatch.setattr(score, "REFERENCE", "agent")
     assert standing_of(score.scores(rows), "agent")["improvement"] == pytest.approx((0.5, 0.5, 0.5))

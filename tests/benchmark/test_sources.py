@@ -79,7 +79,7 @@ def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) 
     assert table["newest"] == table["made-here"] == table["whole"] == table["drop-oldest"]
     assert table["every"] != table["every:every=3"]
     assert sources.load(f"{module}:makes_a_function") == "newest"  # as there is already
-    shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "0"], capsys)
+    shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "1000"], capsys)
 
 
 def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) -> None:
@@ -174,7 +174,7 @@ def test_the_paired_difference_to_a_policy() -> None:
     assert shares["decimate:every=2"][-1] == "–"
     less = float(shares["min-gap"][0]) - float(shares["decimate:every=2"][0])
     assert float(shares["min-gap"][3].replace("−", "-")) == pytest.approx(less, abs=0.0011)
-    assert "| min-gap |" in done.table("markdown").split("\n\n")[-2] and done.html.count("<table>") == 2
+    assert "| min-gap |" in done.table("markdown").split("\n\n")[-2] and done.forms["html"].count("<table>") == 2
     suite = bufgym.compare("afr", "interruption-v1", against="afr", capacity=4, seeds=3, progress=False)
     assert "minus afr's" in suite.table()
     fleet = FleetScenario(robots=2, uplink=scenario.get("lte", duration_s=5.0))
@@ -248,11 +248,11 @@ def test_policies_from_names_functions_and_files(tmp_path: Path, monkeypatch: Pa
 
 
 test_what_is_wrong_is_named = refused(
-    (lambda: bufgym.compare([stubborn], "outage-v1"), "policy stubborn: register it to run it on a suite"),
+    (lambda: bufgym.compare([stubborn], "outage-v1", jobs=2), "policy stubborn: known to this process alone: jobs = 1"),
     (lambda: bufgym.compare([]), "policies = .*: need at least one"),
     (lambda: bufgym.compare(["afr"], "outage-v1", duration_s=3.0), "duration_s: a suite's episodes are frozen"),
     (
         lambda: bufgym.compare(["afr"], "interruption", seeds=1).table("html"),
-        "form = 'html': must be 'plain' or 'markdown'",
+        "form = 'html': must be one of 'plain', 'markdown', 'latex'",
     ),
 )

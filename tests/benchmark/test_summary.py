@@ -1,4 +1,4 @@
-"""The summary that tasks share, bootstrap intervals, the task of stress, by hand; the leaderboard and its rows."""
+"""The summary that tasks share, the task of stress, by hand; the leaderboard and its rows."""
 
 import math
 from collections.abc import Mapping
@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.stats
 from cli_cases import fails, shown
 from refusal_cases import refuse
 from sweep_cases import exactly
-from test_score import TWO_CELLS, cell_of, noisy, rows_of, standing_of, width
+from test_score import TWO_CELLS, noisy, rows_of, standing_of, width
 
-from bufgym.benchmark import leaderboard, report
-from bufgym.benchmark.bootstrap import interval, links_drawn, links_in, stream, students_t, times_drawn
+from bufgym.benchmark import bootstrap, leaderboard, report
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.leaderboard import Entry, entries
 from bufgym.benchmark.report import tables
@@ -185,88 +183,36 @@ def test_a_row_whose_policy_changed_is_stale(monkeypatch: pytest.MonkeyPatch) ->
     fingerprints._of_one.cache_clear()
 
 
+def test_a_page_whose_statistics_changed_is_stale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another constant of theirs is planted: the page that was stamped before is named, and stamped anew it is not."""
+    table = "| afr | 0.346 [0.301, 0.391] |\n"
+    pages = {Path("made.md"): leaderboard.stamped(table), Path("old.md"): table, Path("words.md"): "See [0] and [1].\n"}
+    now = leaderboard.statistics()
+    assert [leaderboard.statistics_of(text) for text in pages.values()] == [now, leaderboard.UNKNOWN, None]
+    assert pages[Path("made.md")] == f"{table}\n<!-- statistics {now} -->\n"
+    assert leaderboard.stale_pages(pages) == []
+    fingerprints._of_one.cache_clear()
+    monkeypatch.setattr(bootstrap, "ROUNDING", 1e-9)
+    assert leaderboard.statistics() != now and leaderboard.stale_pages(pages) == [Path("made.md")]
+    again = leaderboard.stamped(pages[Path("made.md")])
+    assert again.count("<!--") == 1 and leaderboard.stale_pages({Path("made.md"): again}) == []
+    fingerprints._of_one.cache_clear()
+
+
 def test_bad_files_and_rows_are_named(tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, board = tmp_path / "board.csv", REPO / "docs" / "leaderboard.csv"
+    path, board = tmp_path / "board.csv", REPO / "results" / "leaderboard.csv"
     leaderboard.write([], path)
     fails(["validate", "lte-v1/nobody", "--file", board], "no row 'lte-v1/nobody'", capsys)
     monkeypatch.chdir(tmp_path)
-    fails(["validate", "lte-v1/afr"], "docs/leaderboard.csv is that of bufgym's repository", capsys)
+    fails(["validate", "lte-v1/afr"], "results/leaderboard.csv is that of bufgym's repository", capsys)
     fails(["leaderboard", "no-suite", "--file", path], "no-suite", capsys)
     refuse(r"written to a \.csv file", leaderboard.write, [], tmp_path / "board.txt")
 
 
 @pytest.mark.nightly
 def test_a_published_row_holds() -> None:
-    entry = leaderboard.find(REPO / "docs" / "leaderboard.csv", "sustained-v1/min-motion-gap")
+    entry = leaderboard.find(REPO / "results" / "leaderboard.csv", "sustained-v1/min-motion-gap")
     assert leaderboard.validate(entry, jobs=1).values["score"] == pytest.approx(entry.values["score"], abs=1e-12)
-
-
-def test_links_are_drawn_jointly_by_hand() -> None:
-    """Two scenarios over the links a and b, two seeds each; all is won on a and nothing on b.
-
-    A draw of two links is aa, ab, ba or bb, so jointly the mean of the two scores is 1, 1/2, 1/2 or 0: 0 and 1 have 1/4
-    each, and the central 80 % are [0, 1]. Drawn apart, 0 and 1 have 1/16 each, 1/4 and 3/4 have 1/4: [1/4, 3/4].
-    """
-    met = [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
-    won = np.array([1.0, 1.0, 0.0, 0.0])
-    drawn = links_drawn({"time": met, "motion": met, "reverse": met[::-1]})
-    assert drawn["time"].shape == (2001, 4) and (drawn["time"][0] == 1).all()
-    assert (drawn["time"][:, 0] == drawn["time"][:, 1]).all() and (drawn["time"].sum(axis=1) == 4).all()
-    assert (drawn["time"] == drawn["motion"]).all() and (drawn["time"] == drawn["reverse"][:, ::-1]).all()
-    jointly = (drawn["time"] @ won + drawn["motion"] @ won) / 8
-    apart = sum(times_drawn(2, 2000, stream(0, name))[:, 0] / 4 for name in ("time", "motion"))
-    assert np.quantile(jointly, [0.1, 0.9]).tolist() == [0, 1]
-    assert np.quantile(apart, [0.1, 0.9]).tolist() == [0.25, 0.75]
-    h = {"drop-oldest": [0] * 4, "mine": 10 * won}
-    rows = [row for s in ("time", "motion") for row in rows_of(h, [10] * 4, traces=["a", "a", "b", "b"], scenario=s)]
-    made = scores(rows)
-    assert standing_of(made, "mine")["score"] == interval(jointly, 2)
-    assert cell_of(made, "mine", "time").qoi == pytest.approx(interval(10 * jointly, 2))
-
-
-def test_an_interval_by_hand() -> None:
-    """Nine links, of which resamples say -1 or 1 equally often, and the sample 0.
-
-    The standard error is 1, times sqrt(9 / 8) for so few links. Student's t with 8 degrees of freedom is 2.306, so the
-    interval reaches 2.446 to either side; percentiles of -1 and 1 reach 1. A probability ends at 0 and 1.
-    """
-    numbers = np.array([0.0] + [-1.0, 1.0] * 500)
-    assert interval(numbers, 9) == pytest.approx((0, -2.446, 2.446), abs=1e-3)
-    assert interval(numbers, 9, within=(0, 1)) == (0, 0, 1)
-    # Where nearly all resamples agree and a few are far away, the percentiles reach further.
-    skewed = np.array([0.0] + [0.0] * 98 + [10.0] * 2)
-    assert interval(skewed, 9).high == 10 and interval(skewed, 9).low < 0
-    # 1e-13 is a sum in another order, not a difference; one link says nothing about others.
-    assert interval(np.full(9, 1e-13), 9) == (0, 0, 0)
-    assert np.isnan(interval(numbers, 1)[1:]).all()
-
-
-@pytest.mark.parametrize("freedom", [*range(1, 13), 39, 400])
-@pytest.mark.parametrize("confidence", [0.8, 0.95, 0.99])
-def test_students_t_is_that_of_scipy(confidence: float, freedom: int) -> None:
-    expected = scipy.stats.t.ppf((1 + confidence) / 2, freedom)
-    assert students_t(confidence, freedom) == pytest.approx(expected, rel=0.012)
-
-
-def test_links_are_counted_where_there_are_fewest() -> None:
-    """One trace with three seeds: the episodes are drawn. Two traces with five episodes: two links."""
-    one, two = [("a", 0), ("a", 1), ("a", 2)], [("a", 0), ("a", 1), ("b", 0), ("b", 1), ("b", 2)]
-    assert links_in({"one": one}) == 3 and links_in({"one": one, "two": two}) == 2 and links_in({}) == 0
-
-
-def test_on_one_link_episodes_are_drawn() -> None:
-    drawn = links_drawn({"one": [("a", 0), ("a", 1), ("a", 2)]})["one"]
-    assert (drawn.sum(axis=1) == 3).all() and set(drawn[1:].ravel()) == {0, 1, 2, 3}
-
-
-def test_a_link_with_more_seeds_weighs_more() -> None:
-    """Link a has three episodes with H 2 and b one with 6: the mean is 3, on aa it is 2 and on bb 6."""
-    rows = rows_of({"drop-oldest": [2, 2, 2, 6]}, [8] * 4, traces=["a", "a", "a", "b"])
-    low, high = cell_of(scores(rows), "drop-oldest").qoi[1:]
-    drawn = links_drawn({"one": [("a", 0), ("a", 1), ("a", 2), ("b", 0)]})["one"]
-    means = drawn @ np.array([2.0, 2, 2, 6]) / drawn.sum(axis=1)
-    assert set(means) == {2, 3, 6}
-    assert (low, high) == interval(means, 2)[1:] and low < 2 and high > 6
 
 
 def test_share_of_afrs_regret_and_its_paired_difference_by_hand() -> None:

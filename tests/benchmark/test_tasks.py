@@ -192,7 +192,7 @@ def test_a_summary_of_teams_worked_by_hand() -> None:
     mine, base = found.overall
     assert found.cells == {("s", 4): [mine, base]}
     # Two episodes of 4 and 8: drawn means are 4, 6, 6 or 8, so the standard error is sqrt(2) sqrt(2) = 2.
-    assert mine["team"] == pytest.approx((6.0, 6.0 - 2 * T_OF_TWO, 6.0 + 2 * T_OF_TWO), rel=0.03)
+    assert mine["team"] == pytest.approx((6.0, 0.0, 6.0 + 2 * T_OF_TWO), rel=0.03)  # no H is below 0
     assert base["team"].value == 5.0
     assert mine["gain"] == exactly(1.0) and base["gain"] == exactly(0.0)
     assert mine["above"] == exactly(0.5) and base["above"] == base["below"] == exactly(0.0)
@@ -208,8 +208,8 @@ def test_intervals_are_over_episodes_not_robots() -> None:
     many = 100
     rows = [*team_rows("afr", (1.0,) * many, (1.0,) * many), *team_rows("mine", (1.0,) * many, (3.0,) * many)]
     mine = FLEET.summary(rows).standings["mine"]
-    for gained, value, error in ((mine["gain"], 1.0, 1.0), (mine["above"], 0.5, 0.5)):
-        assert gained == pytest.approx((value, value - error * T_OF_TWO, value + error * T_OF_TWO), rel=0.03)
+    assert mine["gain"] == pytest.approx((1.0, 1 - T_OF_TWO, 1 + T_OF_TWO), rel=0.03)
+    assert mine["above"] == (0.5, 0.0, 1.0)  # and not beyond, as a share of robots
 
 
 def test_rounding_is_no_gain_and_nothing_is_fair() -> None:

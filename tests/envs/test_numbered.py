@@ -113,7 +113,7 @@ def suite_env(**arguments: Any) -> Any:
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (lambda suite: suite.reset(options={"scenario": "time"}), "seed = None: must be a whole number"),
+        (lambda suite: suite.reset(options={"scenario": "time"}), "options: no seed: it names a row, as in options="),
         (lambda suite: suite.reset(options={"scenario": "no", "seed": 0}), "'no': must be one of time"),
         (lambda suite: suite.reset(options={"seed": 0}), "scenario: missing; a suite's row has one"),
         (lambda suite: suite.reset(options={"scenario": "time", "seed": 2_000}), "trace = 2: must be 0..1"),
@@ -123,6 +123,7 @@ def suite_env(**arguments: Any) -> Any:
         ),
         (lambda suite: suite.reset(options={"trace": "nope"}), "unknown trace 'nope'"),
         (lambda suite: suite.reset(options={"episode": None, "seed": 0}), "options: an episode, or its scenario"),
+        (lambda suite: suite.reset(options=5), "options = 5: must be a dict of episode, scenario, trace, seed"),
         (lambda suite: suite.reset(options={"number": 3}), "known: episode, scenario, trace, seed"),
         (
             lambda _: SenderEnv("lte", L, actions="slots").reset(options={"scenario": "lte", "seed": 0}),

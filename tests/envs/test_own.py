@@ -279,6 +279,7 @@ test_what_is_refused = refused(
     (lambda: SenderEnv(reward={"late:deadline_s=0": 1}, actions="slots"), "deadline_s = 0.0: must be a number > 0"),
     (lambda: SenderEnv(reward={"delay": "much"}, actions="slots"), "the weight of 'delay' must be a finite number"),
     (lambda: SenderEnv("topics", reward="late:deadline_s=1"), "is for one queue; each topic has"),
+    (lambda: SenderEnv(tells_duration=2), "tells_duration = 2: must be True or False"),
     (lambda: SenderEnv(bound="yes", actions="slots"), "bound = 'yes': must be True or False"),
     *((lambda c=c: out_of_bounds(c), "field 'far': is 1.5: must lie in its bounds, 0..1") for c in (False, True)),
     *((lambda c=c: no_number(c), "reward term 'n': is no finite number") for c in (False, True)),

@@ -57,6 +57,10 @@ def html(summary: Summary) -> str:
     return _ranking(summary, summary.overall, str).html()
 
 
+def latex(summary: Summary) -> str:
+    return _ranking(summary, summary.overall, str).latex()
+
+
 def intro(run: SuiteRun) -> list[str]:
     manifest = run.manifest
     lines = [f"Suite {manifest['suite']}, {manifest['split']}: {manifest['about']}.", manifest["episodes"]]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import ratio
+from bufgym.benchmark.bootstrap import NOT_NEGATIVE, SHARES, ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import Quantity, Run, Summary, by_run, summarise
@@ -77,13 +77,26 @@ class FleetTask(Task):
         below = f"robots whose H is below {same}. The rest are equal"
         jain = "Jain's index of the robots' H, (sum H)^2 / (N sum H^2): 1 if all are equal, 1/N if one has everything"
         return (
-            Quantity("team", "team QoI", score, "mean over the robots of H, mean over episodes", interval=False),
-            Quantity("gain", f"gain over {afr}", signed, f"team QoI minus {afr}'s team QoI", versus=afr, drawn=True),
-            Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True),
-            Quantity("below", "below", percent, below, interval=False, versus=afr),
-            Quantity("worst", "worst robot", score, "the least H of a robot, mean over episodes", interval=False),
             Quantity(
-                "fairness", "fairness", partial(decimal, digits=4), f"{jain} (Jain, Chiu and Hawe 1984)", interval=False
+                *("team", "team QoI", score, "mean over the robots of H, mean over episodes"),
+                interval=False,
+                within=NOT_NEGATIVE,
+            ),
+            Quantity("gain", f"gain over {afr}", signed, f"team QoI minus {afr}'s team QoI", versus=afr, drawn=True),
+            Quantity("above", f"robots above {afr}'s", percent, above, versus=afr, drawn=True, within=SHARES),
+            Quantity("below", "below", percent, below, interval=False, versus=afr, within=SHARES),
+            Quantity(
+                "worst",
+                "worst robot",
+                score,
+                "the least H of a robot, mean over episodes",
+                interval=False,
+                within=NOT_NEGATIVE,
+            ),
+            Quantity(
+                *("fairness", "fairness", partial(decimal, digits=4), f"{jain} (Jain, Chiu and Hawe 1984)"),
+                interval=False,
+                within=SHARES,
             ),
         )
 

@@ -128,7 +128,7 @@ class QueueTask(Task):
         quantities = (*self.quantities(), *([difference(SHARE, against)] if against else []))
         if not scored.exact:
             quantities = tuple(q._replace(title=REGRET_AT_MOST) if q.key == "regret" else q for q in quantities)
-        return Summary(quantities, "score", scored.standings, {}, self.baseline, scored)
+        return Summary(quantities, "score", scored.standings, {}, self.baseline, scored, scored.remarks)
 
     def tables(
         self, rows: Sequence[Row], summary: Summary, scenario: Any, unranked: Unranked, hidden: str
@@ -138,7 +138,7 @@ class QueueTask(Task):
         texts = {(c.capacity, c.policy): bootstrap.written(c.score, score)[: min(c.episodes, 2)] for c in cells}
         means = table.means_table(rows, unranked, {place: " ".join(text) for place, text in texts.items()}, hidden)
         scale = [table.SCORE, *[table.BRACKETS] * any(c.episodes > 1 for c in cells)] if "score" in means.head else []
-        means = means._replace(notes=[*scale, *means.notes, *self._bound_notes(rows, scenario)])
+        means = means._replace(notes=[*scale, *means.notes, *self._bound_notes(rows, scenario), *summary.notes])
         paired = [quantity for quantity in summary.quantities if quantity.key in ("share", "against")]
         if len(paired) == 1:
             return [means]

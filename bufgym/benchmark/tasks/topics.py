@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bufgym.benchmark.bootstrap import ratio
+from bufgym.benchmark.bootstrap import NOT_NEGATIVE, SHARES, ratio
 from bufgym.benchmark.episodes import Numbers
 from bufgym.benchmark.rows import Layout, Row, columns_of
 from bufgym.benchmark.summary import KEY, Quantity, Summary, by_run, summarise, title
@@ -91,14 +91,36 @@ class TopicsTask(Task):
         late = "share of messages delivered after their deadline, among all delivered on topics with a deadline"
         rate = "messages delivered a second, until the last arrival or receipt"
         return (
-            Quantity("qoi", "QoI", _one_digit, "sum over topics of weight x H, mean over episodes", interval=False),
-            Quantity("relative", f"QoI / {BASELINE}", score, f"QoI divided by {BASELINE}'s QoI. {paired}", drawn=True),
-            Quantity("lost", "no_drop lost", lambda number: f"{round(number, 1):g}", lost, interval=False, total=True),
-            Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False),
-            Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True),
-            Quantity("age_others_s", "age, others (s)", _seconds, others_age),
-            Quantity("late", "late", percent, late, interval=False),
-            Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False),
+            Quantity(
+                "qoi",
+                "QoI",
+                _one_digit,
+                "sum over topics of weight x H, mean over episodes",
+                interval=False,
+                within=NOT_NEGATIVE,
+            ),
+            Quantity(
+                "relative",
+                f"QoI / {BASELINE}",
+                score,
+                f"QoI divided by {BASELINE}'s QoI. {paired}",
+                drawn=True,
+                within=NOT_NEGATIVE,
+            ),
+            Quantity(
+                "lost",
+                "no_drop lost",
+                lambda number: f"{round(number, 1):g}",
+                lost,
+                interval=False,
+                total=True,
+                within=NOT_NEGATIVE,
+            ),
+            Quantity("age_first_s", f"age, {first} (s)", _seconds, first_age, interval=False, within=NOT_NEGATIVE),
+            Quantity("age_relative", f"age / {BASELINE}", score, relative_age, drawn=True, within=NOT_NEGATIVE),
+            Quantity("age_others_s", "age, others (s)", _seconds, others_age, within=NOT_NEGATIVE),
+            Quantity("late", "late", percent, late, interval=False, within=SHARES),
+            Quantity("rate_hz", "msg/s", _one_digit, rate, interval=False, within=NOT_NEGATIVE),
         )
 
     def summary(self, rows: Sequence[Row], unranked: Unranked = NOBODY, against: str = "") -> Summary:

@@ -1,8 +1,8 @@
 """The parts of a suite: a name, scenarios in three splits, capacities, and a number of episodes."""
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,15 @@ class Suite:
     """Required contents of a folder of recordings; empty if the suite needs none."""
     kind: str = "queue"
     """Task of its scenarios: a name in ``bufgym.benchmark.tasks``."""
+    first_seeds: Mapping[str, int] = field(default_factory=dict)
+    """The first seed of each split, where splits share their scenarios; by default 0."""
+    source: str = ""
+    """``module:NAME`` of one's own suite; empty for any other."""
+
+    @property
+    def own(self) -> bool:
+        """Whether it is one's own."""
+        return bool(self.first_seeds)
 
     def settings(self, split: str, data: str | Path | None = None) -> dict[str, Setting]:
         """The scenarios of one split by label; ``data`` is the folder of recordings, for suites that need one.

@@ -63,7 +63,7 @@ NEEDS_LIBRARIES = {
     **dict.fromkeys(OF_FRAMES, ("cv2", "rvl", "scipy")),
 }
 
-CLAIMS = Path(__file__).resolve().parents[3] / "docs" / "claims.md"
+CLAIMS = Path(__file__).resolve().parents[3] / "results" / "claims.md"
 SLOW = {"afr-qoi-task", "afr-fig7", "afr-fig9", "robofleet-table2"}
 
 

@@ -1,6 +1,13 @@
 """Log of a live queue's events, with enough detail to repeat every decision in the simulator.
 
-See docs/methods.md, "The log of a live queue".
+A record is a small dictionary with its time, ``us``. In a file it is a JSON message of an MCAP recording, on the
+channel of its event:
+
+    settings  policy, parameters, capacity, max_bytes, v, decide_at, topics, window, ends_us
+    put       seq, size_bytes, x, topic, uniform, carried: bytes that the link had carried by then
+    dequeued  seq: the socket took it
+    gone      seq, carried: the link has carried it
+    dropped   seq, why: rejected, evicted for another, limited, dropped at the head
 """
 
 import json

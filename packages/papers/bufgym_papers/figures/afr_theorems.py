@@ -1,6 +1,6 @@
 """Theorems of the AFR paper [wang2022afr], checked on the simulator for every L, T and V of a grid.
 
-See docs/methods.md, "The theorems of AFR, exactly".
+See packages/papers/bufgym_papers/figures/README.md, "The theorems of AFR, exactly".
 """
 
 import math

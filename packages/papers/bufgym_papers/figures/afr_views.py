@@ -1,6 +1,6 @@
 """Camera views under four motions: three of the AFR paper, and a look aside along a corridor, which is ours.
 
-See docs/methods.md, "Views under four motions".
+See packages/papers/bufgym_papers/figures/README.md, "Views under four motions".
 """
 
 import math

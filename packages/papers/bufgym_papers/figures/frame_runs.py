@@ -1,6 +1,6 @@
 """Recordings, link and runs shared by Fig. 7 and 8 of the AFR paper when frames are really mapped and tracked.
 
-See docs/methods.md, "Mapping and tracking with the frames that arrive".
+See packages/papers/PERCEPTION.md, "Fig. 7 and 8 of the AFR paper".
 """
 
 import functools

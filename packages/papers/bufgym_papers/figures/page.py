@@ -1,7 +1,7 @@
-"""Writer of docs/claims.md, which lists every claim of the papers, the command that tests it, and the result.
+"""Writer of results/claims.md, which lists every claim of the papers, the command that tests it, and the result.
 
-``bufgym reproduce --claims docs/claims.md --data DIR`` writes it. Figures that need recordings are marked as not
-checked without them. ``bufgym reproduce afr-fig7 --claims docs/claims.md`` renews the rows of one figure.
+``bufgym reproduce --claims results/claims.md --data DIR`` writes it. Figures that need recordings are marked as not
+checked without them. ``bufgym reproduce afr-fig7 --claims results/claims.md`` renews the rows of one figure.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ HEAD = """\
 # The papers' claims
 
 This page lists every sentence of the two papers that we know of and that can be checked. Each row has the command that
-tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](references.bib).
+tests the sentence, our number, and the verdict. Keys in brackets are from [references.bib](../docs/references.bib).
 
 The sentences are in our words, read at the place that is named: a section, an equation or a figure. "Our addition"
 marks sentences that the papers do not have. Where a paper leaves a parameter open, ours is a stated default of the
@@ -30,7 +30,7 @@ less or more, wherever a paper says it: about 20 % is from 15 to 25 %, about 10 
 
 This page is made by
 
-    bufgym reproduce --claims docs/claims.md --data DIR
+    bufgym reproduce --claims results/claims.md --data DIR
 
 DIR is the folder of recordings. `make test` compares the rows marked † with the output of the code. `make claims`
 compares all rows.

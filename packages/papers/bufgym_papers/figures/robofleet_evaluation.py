@@ -1,6 +1,6 @@
 """Messages, sending programs and outcomes shared by Robofleet's Fig. 3 to 7.
 
-See docs/methods.md, "Robofleet's figures".
+See packages/papers/bufgym_papers/figures/README.md, "Robofleet's figures".
 """
 
 from __future__ import annotations

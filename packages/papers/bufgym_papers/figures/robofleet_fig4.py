@@ -1,6 +1,6 @@
 """Fig. 4 of the Robofleet paper: time until latency is nominal again after a dropout.
 
-See docs/methods.md, "Recovery after a dropout".
+See packages/papers/bufgym_papers/figures/README.md, "Recovery after a dropout".
 """
 
 import math

@@ -1,6 +1,6 @@
 """Camera tracking by KinectFusion on the frames that arrived alone, and where it fails.
 
-See docs/methods.md, "When a camera is lost".
+See packages/papers/PERCEPTION.md, "Tracking".
 """
 
 from collections.abc import Callable, Iterable
