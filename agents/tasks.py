@@ -72,7 +72,7 @@ class Suites:
         return self.capacities or suites.get(suite).capacities
 
 
-FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "interruption", "random", "uplinks")
+FAMILY_NAMES = ("task", "frames", "lte", "generated", "outage", "heavy", "light", "random", "uplinks")
 ALL, RECORDED = "all", "uplinks"
 
 

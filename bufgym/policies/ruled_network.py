@@ -6,8 +6,9 @@ decision. Its network has an output for each action:
 
     0: accept where there is room, else drop the cheapest;  1 to k + 1: candidates;  k + 2: what the rule does
 
-and the highest output of those that are offered decides. On a link whose rate has not changed by over 10 % for
-``EVEN_US`` and is steady, the rule alone is offered. See docs/methods.md, "Networks among candidates".
+and the highest output of those that are offered decides. The rule alone is offered until a rate has been
+measured, on a steady link whose rate has not changed by over 10 % for ``EVEN_US``, and where hindsight teaches nothing
+(``left_to_rule``). See docs/methods.md, "Networks among candidates".
 """
 
 import math
@@ -72,12 +73,12 @@ def rule_decision(buffer: Buffer, arrival: Arrival, rule: Memory) -> int:
 
 @kernel
 def even(buffer: Buffer) -> bool:
-    """Whether the link has carried at one rate for ``EVEN_US``.
+    """Whether the link has carried at one rate for ``EVEN_US``, or no rate has been measured yet.
 
     Regret is so small there that a network which wavers once loses several times what the rule loses.
     """
-    past = buffer.past
-    return bool(past[CHANGED_US] > 0 and buffer.now_us - past[CHANGED_US] > EVEN_US and steady(buffer))
+    changed_us = buffer.past[CHANGED_US]
+    return bool(changed_us == 0 or (buffer.now_us - changed_us > EVEN_US and steady(buffer)))
 
 
 @kernel

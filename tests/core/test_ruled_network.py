@@ -15,6 +15,7 @@ from bufgym import policies
 from bufgym.model import observe, qoi
 from bufgym.model.buffer import ACCEPT, REJECT
 from bufgym.model.link import Link
+from bufgym.model.past import CHANGED_US
 from bufgym.policies import chains, price_dp, rule_inputs, target_gap, thinning, weights
 from bufgym.policies.past_inputs import NOTHING
 from bufgym.policies.registry import Policy
@@ -50,7 +51,7 @@ def reference(made, margins):
         does, room = decisions_of(buffer, arrival, [j for j, _ in candidates])
         numbers = {f.name: f.function(buffer, arrival) for f in observe.ON_BOARD_FIELDS}
         past = [4 * (numbers[name] - nothing) for name, nothing in NOTHING.items()]
-        is_even = numbers["since_change"] > 0.6 and thinning.steady(buffer)  # 3 s beside 2 s
+        is_even = buffer.past[CHANGED_US] == 0 or (numbers["since_change"] > 0.6 and thinning.steady(buffer))  # 3 s
         is_left = buffer.capacity <= 2 or buffer.v[0] == qoi.SATURATING or a > 0 or target_gap.bursty(rule)
         if is_even or is_left:
             does = [None for _ in does]
