@@ -32,8 +32,8 @@ from torch import Tensor
 
 import bufgym
 from bufgym import policies, scenario
-from bufgym.envs import ObservationForm
 from bufgym.envs.expert import dataset
+from bufgym.envs.observation import ObservationForm
 from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
 from bufgym.oracle import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy

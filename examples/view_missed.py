@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, scenario, sim
-from bufgym.oracle import BASELINE, clairvoyant, normalised_score
+from bufgym.oracle import clairvoyant, normalised_score
+from bufgym.oracle.measure import BASELINE
 from bufgym.sim import NEVER, outcome
 
 

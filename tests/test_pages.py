@@ -218,7 +218,7 @@ def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> N
         "sb3_contrib": "sb3_contrib",
         "stable_baselines3": "bufgym.sb3",
         "cma": "agents.tuning",
-        "pettingzoo": "parallel_env",
+        "pettingzoo": "FleetEnv",
     }
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:
