@@ -37,15 +37,14 @@ if TYPE_CHECKING:
 __all__ = ["Trace", "Workload", "load", "read_workload"]
 
 __getattr__ = on_demand(__name__, {
-    "Columns": "formats.tables",
-    "read_bag": "formats.bags", "FORMATS": "formats.links", "detect_format": "formats.links",
-    "read_trace": "formats.links", "read_motion": "formats.motions", "write_motion_csv": "formats.motions",
-    "read_workload": "formats.recordings", "workload_from_bag": "formats.recordings",
-    "read_workload_csv": "formats.workloads",
+    "Columns": "formats.tables", "read_bag": "formats.bags", "FORMATS": "formats.links",
+    "detect_format": "formats.links", "read_trace": "formats.links", "read_motion": "formats.motions",
+    "write_motion_csv": "formats.motions", "read_workload": "formats.recordings",
+    "workload_from_bag": "formats.recordings", "read_workload_csv": "formats.workloads",
     "write_workload_csv": "formats.workloads", "WRITERS": "formats.writers", "difference": "formats.writers",
     "write_csv": "formats.writers", "write_mahimahi": "formats.writers", "drive_motion": "generate.driving",
-    "synthetic_lte": "generate.lte", "markov_link": "generate.markov", "read_links": "generate.parameters", "ramp": "generate.rules", "steady": "generate.rules",
-    "tunnel": "generate.rules",
+    "synthetic_lte": "generate.lte", "markov_link": "generate.markov", "read_links": "generate.parameters",
+    "ramp": "generate.rules", "steady": "generate.rules", "tunnel": "generate.rules",
 })  # fmt: skip
 
 

@@ -13,8 +13,8 @@ from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.envs.expert.player import Player
 
 clairvoyant = Clairvoyant
-"""``clairvoyant(env)`` knows the whole episode. It has ``actions()`` [n], ``values()`` and ``regrets()`` [n, actions]."""
+"""``clairvoyant(env)`` knows the whole episode: ``actions()`` [n], ``values()`` and ``regrets()`` [n, actions]."""
 policy = PolicyExpert
-"""``policy(env, "afr")`` makes an expert of a policy; it has ``actions()`` [n]."""
+"""``policy(env, "afr")`` makes an expert of a policy: ``actions()`` [n]."""
 
 __all__ = ["Player", "clairvoyant", "online", "policy"]
