@@ -17,7 +17,7 @@ from bufgym import policies, scenario
 from bufgym.cli.options import Count
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle.foresight import clairvoyant
+from bufgym.oracle.clairvoyant import clairvoyant
 from bufgym.scenario import Episode, messages
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders

@@ -141,7 +141,8 @@ def test_one_list_of_public_names(module: str) -> None:
     """What a module has in ``__all__`` is what docs/api.md explains and docs/stability.md promises."""
     shown = re.findall(r"^::: (\S+)\n    options:\n      members: \[(.*)\]$", texts()["docs/api.md"], re.MULTILINE)
     explained = {name: names.split(", ") for name, names in shown}
-    assert explained.keys() == public_names().keys() and texts()["docs/api.md"].count("\n::: ") == len(explained)
+    explained["bufgym.oracle"].append("clairvoyant")  # by itself on the page, as its module has the same name
+    assert explained.keys() == public_names().keys() and texts()["docs/api.md"].count("\n::: ") == len(explained) + 1
     assert sum(map(len, explained.values())) <= 60
     if module == "bufgym.sb3":
         pytest.importorskip("sb3_contrib", reason=needs("extras", "stable-baselines3"))

@@ -18,7 +18,7 @@ from bufgym.utils.files import PACKAGE, replaced
 SOURCES = (
     *(
         f"oracle/{name}.py"
-        for name in ("beam", "foresight", "interruption", "labels", "pieces", "programme", "unequal")
+        for name in ("beam", "clairvoyant", "interruption", "labels", "pieces", "programme", "unequal")
     ),
     *(f"model/{name}.py" for name in ("buffer", "link", "qoi")),
 )

@@ -6,7 +6,7 @@ import numpy as np
 
 from bufgym import policies
 from bufgym.model.buffer import UNLIMITED_BYTES
-from bufgym.oracle.foresight import clairvoyant
+from bufgym.oracle.clairvoyant import clairvoyant
 from bufgym.sim import Senders, run
 from bufgym.sim.metrics import outcome
 

@@ -18,7 +18,7 @@ from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
 from bufgym.oracle import beam, cached, clairvoyant, labels, pieces, programme, unequal
-from bufgym.oracle.foresight import Plan
+from bufgym.oracle.clairvoyant import Plan
 from bufgym.oracle.interruption import integer
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.scenario.numbered import draw

@@ -16,7 +16,7 @@ from bufgym.benchmark.summary import Quantity, Summary, difference, table_over
 from bufgym.benchmark.table import NOBODY, REGRET_AT_MOST, Table, Unranked, percent, score
 from bufgym.benchmark.tasks.task import Result, Task
 from bufgym.oracle import Plan, clairvoyant
-from bufgym.oracle.foresight import privileged
+from bufgym.oracle.clairvoyant import privileged
 from bufgym.oracle.measure import BASELINE, TIE, regret
 from bufgym.policies import Policy
 from bufgym.scenario import Episode, Scenario
