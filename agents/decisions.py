@@ -21,8 +21,8 @@ from agents.callbacks import Budget, Checkpoints, Curve, Progress, Validation, c
 from agents.learner import Learner
 from agents.runs import MODEL, Numbers, Run, Validations
 from agents.settings import SingleDecisions
-from bufgym import sb3
 from bufgym.policies import weights
+from bufgym.sb3 import export
 
 Decisions = TypeVar("Decisions", bound=SingleDecisions)
 
@@ -63,7 +63,7 @@ class DecisionLearner(Learner[Decisions]):
         curve = Curve(home / "curve.csv", model.num_timesteps)
 
         def measure(model: Any) -> Numbers:
-            return objective.validate(sb3.weights_of(model).policy(settings.algo))
+            return objective.validate(export.weights_of(model).policy(settings.algo))
 
         validations = Validations(home, objective.columns, objective.best, settings, model.num_timesteps)
         validation = Validation(home, validations, measure, objective.message, curve)
@@ -80,5 +80,5 @@ class DecisionLearner(Learner[Decisions]):
         shutil.copyfile(checkpoint(home, int(validations.best[0])), home / "model.zip")
         spent = curve.record.rows[-1][1] if curve.record.rows else 0.0
         kept = self.algorithm.load(home / "model.zip", device="cpu")
-        weights.save(home / MODEL, sb3.weights_of(kept), self.notes(seed, settings.algo))
+        weights.save(home / MODEL, export.weights_of(kept), self.notes(seed, settings.algo))
         return Run(seed, home, spent, curve.record.rows, validations.rows, validations.choose)

@@ -22,7 +22,8 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.run import run as run_policies
 from bufgym.benchmark.score import DISCRIMINATIVE, regret
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.oracle import BASELINE, measure, normalised_score
+from bufgym.oracle import measure, normalised_score
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.scenario import Episode
 from bufgym.scenario.numbered import by_trace, draw

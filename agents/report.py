@@ -25,7 +25,7 @@ from bufgym.benchmark.rows import Row, write_rows
 from bufgym.benchmark.score import Scores, scores
 from bufgym.benchmark.table import decimal, equal_rows_notes, unranked_among, with_equal_rows
 from bufgym.benchmark.tasks import TASKS
-from bufgym.oracle import BASELINE
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy, registry
 from bufgym.utils.files import shipped
 from bufgym.utils.tables import aligned

@@ -167,7 +167,7 @@ def test_a_policy_of_ones_own_is_tuned(capsys: Capsys) -> None:
         "from bufgym import policies\n"
         "@policies.register('own-tuned', parameters={'first': 1.9}, compile=True)\n"
         "def own(buffer, arrival, memory):\n"
-        "    if policies.has_space(buffer, arrival):\n"
+        "    if len(buffer.slots) < buffer.capacity:\n"
         "        return policies.ACCEPT\n"
         "    return 0 if buffer.parameters[0] > 2 else policies.REJECT\n"
     )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from bufgym.benchmark.curves import curves
     from bufgym.benchmark.own_suite import suite
 
-__all__ = ["ENVIRONMENTS", "BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
+__all__ = ["BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
 
 ENVIRONMENTS = {
     "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),

@@ -15,7 +15,8 @@ import numpy as np
 from bufgym import policies, scenario
 from bufgym.benchmark.run import run
 from bufgym.envs import FleetVecEnv, SenderVectorEnv, own
-from bufgym.envs.expert import Clairvoyant, Player, online
+from bufgym.envs.expert import Player, online
+from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.jit import Hook, code, named
 from bufgym.jit.values import NotNumbersError
 from bufgym.kernels.program import Program

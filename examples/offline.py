@@ -15,12 +15,14 @@ CQL (Kumar et al. 2020) is Q-learning on recorded steps that also pushes down th
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import d3rlpy
+import gymnasium as gym
 import minari
 import numpy as np
 import torch
@@ -28,13 +30,12 @@ from d3rlpy.dataset import TransitionMiniBatch
 from d3rlpy.models.q_functions import QFunctionFactory
 from d3rlpy.models.torch.q_functions import DiscreteMeanQFunctionForwarder, DiscreteQFunction, QFunctionOutput
 from gymnasium import spaces
+from gymnasium.spaces.utils import flatdim
 from torch import Tensor
 
 import bufgym
 from bufgym import policies, scenario
-from bufgym.envs import ObservationForm
-from bufgym.envs.expert import dataset
-from bufgym.model.observe import CONTEXT_FIELDS, SLOT_FIELDS
+from bufgym.cli import main as run_bufgym
 from bufgym.oracle import normalised_score
 from bufgym.sb3 import SlotPolicy, as_policy
 
@@ -42,8 +43,8 @@ TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 TEST = ["lte-synthetic-6", "lte-synthetic-7"]
 RIVALS = ("min-motion-gap", "afr", "drop-oldest")
 L = 8
-FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, L)
-"""Meaning of the numbers of a flat observation."""
+FIELDS = gym.make("bufgym/Uplink-v0", capacity=L, actions="slots", observation="dict").observation_space
+"""Fields of an observation. A data set has them flat, one behind the other."""
 
 
 @dataclass
@@ -88,8 +89,11 @@ def read(kind: str, settings: Settings) -> Steps:
     """Read the data set of that kind; make it first if it is missing."""
     name, folder = f"bufgym/uplink/{kind}-v0", Path(settings.data)
     if not (folder / name).exists():
-        options = {"capacity": L, "duration_s": settings.duration_s, "traces": TRAIN, "observation": "flat"}
-        dataset.make("Uplink-v0", kind, settings.episodes, out=folder, seed=settings.seed, regret=False, **options)
+        options = {"duration_s": settings.duration_s, "traces": TRAIN, "actions": "slots", "observation": "flat"}
+        command = f"dataset make --kind {kind} --episodes {settings.episodes} --capacity {L} --seed {settings.seed}"
+        further = [part for key, value in options.items() for part in ("--option", f"{key}={json.dumps(value)}")]
+        if code := run_bufgym([*command.split(), "--no-regret", *further, "--out", str(folder)]):
+            raise SystemExit(code)
     os.environ["MINARI_DATASETS_PATH"] = str(folder.absolute())
     parts = [
         (e.observations[:-1], e.actions, e.rewards, e.observations[1:], e.terminations)
@@ -100,12 +104,12 @@ def read(kind: str, settings: Settings) -> Steps:
 
 def new_network(settings: Settings) -> SlotPolicy:
     """An untrained slot network."""
-    return SlotPolicy(FORM.space, spaces.Discrete(L + 2), lambda _: settings.learning_rate)
+    return SlotPolicy(FIELDS, spaces.Discrete(L + 2), lambda _: settings.learning_rate)
 
 
 def scored(network: SlotPolicy, seen: Tensor) -> Tensor:
     """Network's number for each action, [n, L + 2], very low for an invalid action."""
-    observation = FORM.of(seen)
+    observation = dict(zip(FIELDS, seen.split([flatdim(space) for space in FIELDS.values()], dim=1), strict=True))
     features = network.extract_features(observation)
     full = observation["occupied"][:, :L].min(dim=1, keepdim=True).values
     valid = torch.cat([observation["occupied"][:, :L], torch.ones_like(full), 1 - full], dim=1)
@@ -174,7 +178,7 @@ def conservative(steps: Steps, settings: Settings) -> SlotPolicy:
         alpha=settings.alpha,
         reward_scaler=d3rlpy.preprocessing.MultiplyRewardScaler(settings.reward_scale),
     ).create(device="cpu:0")
-    cql.create_impl((FORM.numbers,), L + 2)
+    cql.create_impl((flatdim(FIELDS),), L + 2)
     for batch in batches(steps, settings):
         column = {name: part[batch, None].astype(np.float32) for name, part in vars(steps).items() if part.ndim == 1}
         drawn = TransitionMiniBatch(

@@ -10,7 +10,6 @@ import gymnasium as gym
 
 import bufgym
 from bufgym import scenario
-from bufgym.model import qoi
 
 
 def doorways(d: float) -> float:
@@ -24,7 +23,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="episodes of the benchmark on each link")
     options = parser.parse_args()
 
-    v = qoi.load(doorways)  # checked here: V(0) = 0, rising, at most 1, concave
+    v = scenario.get("lte", value=doorways).value  # checked here: V(0) = 0, rising, at most 1, concave
     print(f"V(0.1) = {v(0.1):.3f}, V(1) = {v(1.0):.3f}")
 
     # As text it stands in YAML files and env.spec.to_json() as well; value=doorways does the same.

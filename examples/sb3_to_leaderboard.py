@@ -16,7 +16,7 @@ from pathlib import Path
 
 from stable_baselines3 import PPO
 
-from bufgym.benchmark import leaderboard
+from bufgym.benchmark.leaderboard import of_folder, write
 from bufgym.cli import main as bufgym
 from bufgym.sb3 import make_vec_env
 
@@ -47,10 +47,10 @@ def main() -> None:
     chosen = ["--policies", f"{model},afr,drop-oldest", "--format", "csv", "--out", str(rows)]
     if code := bufgym(["bench", "--suite", options.suite, *chosen, *options.bench]):
         raise SystemExit(code)
-    board = leaderboard.of_folder(rows)
+    board = of_folder(rows)
     # By its file, as the command in the row names it.
     board = [replace(entry, policy=str(model)) if entry.policy == model.stem else entry for entry in board]
-    leaderboard.write(board, options.out / "leaderboard.csv")
+    write(board, options.out / "leaderboard.csv")
     print((options.out / "leaderboard.md").read_text(encoding="utf-8"))
 
 

@@ -10,13 +10,16 @@ the camera's image in it: three quarters are what matching two images for a map 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bufgym import policies, scenario, sim
-from bufgym.oracle import BASELINE, clairvoyant, normalised_score
-from bufgym.sim import NEVER, outcome
+from bufgym.oracle import clairvoyant, normalised_score
+from bufgym.sim import outcome
+
+BASELINE = "drop-oldest"
 
 
 def missed(x: NDArray[np.float64], arrived: NDArray[np.bool_], overlap: float) -> float:
@@ -38,7 +41,8 @@ def main() -> None:
     parser.add_argument("--score", type=float, default=0.7, help="what would this miss? (%(default)s)")
     options = parser.parse_args()
     uplink = scenario.get("lte", duration_s=options.seconds)
-    episodes = [scenario.draw(part, seed) for _, part in scenario.by_trace(uplink) for seed in range(options.seeds)]
+    parts = [replace(uplink, traces=(trace,)) for trace in uplink.traces]
+    episodes = [scenario.draw(part, seed) for part in parts for seed in range(options.seeds)]
     best = sum(clairvoyant(episode, options.capacity, uplink.value).qoi for episode in episodes)
     h, missed_s = {}, {}
     for name in dict.fromkeys([BASELINE, *options.policies.split(",")]):
@@ -46,7 +50,7 @@ def main() -> None:
         h[name] = sum(outcome(senders, i).qoi for i in range(len(episodes)))
         logs = [np.asarray(log)[: len(e.arrivals)] for log, e in zip(senders.batch.log, episodes, strict=True)]
         shares = [
-            missed(e.arrivals["x"], log["dropped_us"] == NEVER, options.overlap)
+            missed(e.arrivals["x"], log["dropped_us"] < 0, options.overlap)
             for e, log in zip(episodes, logs, strict=True)
         ]
         missed_s[name] = options.seconds * float(np.mean(shares))

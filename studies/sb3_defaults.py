@@ -35,8 +35,10 @@ from bufgym import policies
 from bufgym import scenario as scenarios
 from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, stream, times_drawn
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.oracle import BASELINE, normalised_score
-from bufgym.sb3 import make_vec_env, takes_masks
+from bufgym.oracle import normalised_score
+from bufgym.oracle.measure import BASELINE
+from bufgym.sb3 import make_vec_env
+from bufgym.sb3.networks import takes_masks
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run
 from bufgym.sim.metrics import outcome

@@ -22,7 +22,7 @@ from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import scores
 from bufgym.benchmark.sweep import Sweep
 from bufgym.benchmark.table import decimal
-from bufgym.oracle import BASELINE
+from bufgym.oracle.measure import BASELINE
 from studies.page import command, table, written
 
 RULES = ("target-gap", "gap-price")

@@ -30,7 +30,7 @@ class Need:
 
     @property
     def command(self) -> str:
-        """The line that brings it."""
+        """What to type, or to do by hand, to have it on this machine."""
         if self.by_hand:
             return self.by_hand
         if self.apt:

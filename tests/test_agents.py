@@ -15,7 +15,7 @@ from bufgym.benchmark.run import run as rows_of
 from bufgym.envs import SenderVectorEnv
 from bufgym.model import qoi
 from bufgym.model.qoi import exponential
-from bufgym.oracle import EveryLength
+from bufgym.oracle.interruption import EveryLength
 from bufgym.policies import weights
 from bufgym.sb3 import GymVecEnv
 from bufgym.scenario import Interruption, suites

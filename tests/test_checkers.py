@@ -88,7 +88,7 @@ def test_torchrl(id: str, form: dict[str, Any]) -> None:
 @every_int8_form
 def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     zoo = pytest.importorskip("pettingzoo.test", reason=needs("extras", "pettingzoo.test"))
-    make = partial(bufgym.envs.parallel_env, robots=robots, **ROBOTS, **form)
+    make = partial(bufgym.envs.FleetEnv, robots=robots, **ROBOTS, **form)
     zoo.parallel_api_test(make(), num_cycles=70)
     zoo.parallel_seed_test(make, num_cycles=20)
     assert "Passed" in capsys.readouterr().out
@@ -102,7 +102,7 @@ def test_pettingzoo_turn_by_turn(form: dict[str, Any]) -> None:
     from pettingzoo.utils import parallel_to_aec
 
     def make() -> Any:
-        return parallel_to_aec(bufgym.envs.parallel_env(robots=3, **ROBOTS, **form))
+        return parallel_to_aec(bufgym.envs.FleetEnv(robots=3, **ROBOTS, **form))
 
     zoo.api_test(make(), num_cycles=70)
     zoo.seed_test(make, num_cycles=20)

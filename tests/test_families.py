@@ -14,7 +14,8 @@ from agents.families import Family
 from agents.mixed_env import Cell
 from bufgym import policies
 from bufgym.jit import JIT
-from bufgym.oracle import EveryLength, integer, law
+from bufgym.oracle import law
+from bufgym.oracle.interruption import EveryLength, integer
 from bufgym.policies import weights
 from bufgym.policies.learned import Network, Weights
 from bufgym.policies.ruled_network import RuledWeights, seen

@@ -85,11 +85,15 @@ def test_the_parser_takes_each_command() -> None:
             app.parse_args([*command, *(["x"] if command[-1] in ("--suite", "--config") else [])])
 
 
-def test_programs_import_public_names_alone() -> None:
-    programs = [block for block in blocks() if block.language == "python"]
+def programs() -> list[tuple[str, str]]:
+    """(page or file, program) of every page, tutorial and example in Python."""
+    found = [(block.page, block.text) for block in blocks() if block.language == "python"]
     paths = [*TUTORIALS, *sorted((REPO / "examples").rglob("*.py"))]
-    programs += [Block(path.name, "python", path.read_text(encoding="utf-8")) for path in paths]
-    for page, _, text in programs:
+    return found + [(path.name, path.read_text(encoding="utf-8")) for path in paths]
+
+
+def test_programs_import_public_names_alone() -> None:
+    for page, text in programs():
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.ImportFrom):
                 private = [name.name for name in node.names if not _is_public(str(node.module), name.name)]
@@ -101,17 +105,51 @@ def test_programs_import_public_names_alone() -> None:
 
 
 def _is_public(module: str, name: str) -> bool:
-    """Whether a subpackage lists the name in ``__all__``, or has a subpackage of this name."""
+    """Whether docs/stability.md has the name, or it is one of the modules there. Packages promise nothing yet."""
     if module.split(".")[0] == "agents":
         return hasattr(importlib.import_module(module), name)
-    if module.split(".")[0] != "bufgym" or module == "bufgym_live.robot.ros2":  # it needs ROS 2
+    if module.split(".")[0] != "bufgym":
         return True
-    below = (
-        importlib.util.find_spec(f"{module}.{name}")
-        if importlib.util.find_spec(module).submodule_search_locations
-        else None
-    )
-    return name in importlib.import_module(module).__all__ or bool(below and below.submodule_search_locations)
+    return name in public_names().get(module, ()) or f"{module}.{name}" in public_names()
+
+
+@cache
+def public_names() -> dict[str, set[str]]:
+    """Module -> its public names, in the table of docs/stability.md."""
+    rows = re.findall(r"^\| `(bufgym[\w.]*)` \| (.*) \|$", texts()["docs/stability.md"], re.MULTILINE)
+    return {module: set(re.findall(r"`(\w+)`", names)) for module, names in rows}
+
+
+def test_programs_use_public_names_alone() -> None:
+    """``traces.Trace`` after ``from bufgym import traces``, too; a public object's own attributes are its class's."""
+    for page, text in programs():
+        tree = ast.parse(text)
+        known = {
+            name.asname or name.name: f"{node.module}.{name.name}"
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom)
+            for name in node.names
+        } | {"bufgym": "bufgym"}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                module = known.get(node.value.id, "")
+                assert module not in public_names() or _is_public(module, node.attr), (page, module, node.attr)
+
+
+@pytest.mark.parametrize("module", ["bufgym", *(m for m in public_names() if m != "bufgym")])
+def test_one_list_of_public_names(module: str) -> None:
+    """What a module has in ``__all__`` is what docs/api.md explains and docs/stability.md promises."""
+    shown = re.findall(r"^::: (\S+)\n    options:\n      members: \[(.*)\]$", texts()["docs/api.md"], re.MULTILINE)
+    explained = {name: names.split(", ") for name, names in shown}
+    explained["bufgym.oracle"].append("clairvoyant")  # by itself on the page, as its module has the same name
+    assert explained.keys() == public_names().keys() and texts()["docs/api.md"].count("\n::: ") == len(explained) + 1
+    assert sum(map(len, explained.values())) <= 60
+    if module == "bufgym.sb3":
+        pytest.importorskip("sb3_contrib", reason=needs("extras", "stable-baselines3"))
+    promised = importlib.import_module(module).__all__
+    assert sorted(promised) == sorted(explained[module]) == sorted(public_names()[module])
+    if "FleetEnv" not in promised or importlib.util.find_spec("pettingzoo"):
+        assert all(getattr(importlib.import_module(module), name) is not None for name in promised)
 
 
 def test_links_and_pictures_lead_somewhere() -> None:
@@ -218,7 +256,7 @@ def test_the_program_runs(block: Block, tmp_path: Path, monkeypatch: Patch) -> N
         "sb3_contrib": "sb3_contrib",
         "stable_baselines3": "bufgym.sb3",
         "cma": "agents.tuning",
-        "pettingzoo": "parallel_env",
+        "pettingzoo": "FleetEnv",
     }
     for package, sign in (needed | {"mcap": ".mcap", "cv2": "bufgym_papers.perception"}).items():
         if sign in block.text:

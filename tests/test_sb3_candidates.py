@@ -22,7 +22,8 @@ from bufgym import cli, policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
-from bufgym.sb3 import as_policy, export, make_vec_env, weights_of
+from bufgym.sb3 import as_policy, make_vec_env
+from bufgym.sb3.export import export, weights_of
 from bufgym.scenario import get as scenario_of
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run

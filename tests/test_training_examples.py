@@ -94,7 +94,9 @@ def test_offline_learns_from_a_data_set(tmp_path: Path, capsys: Capsys) -> None:
     reached = offline["main"](settings)
     assert reached["cloning-medium"] > -0.5 and "cql-medium" in reached and reached["drop-oldest"] == 0
     assert "cql of 960 medium steps" in capsys.readouterr().out
-    seen = torch.zeros(1, offline["FORM"].numbers)
+    from gymnasium.spaces.utils import flatdim
+
+    seen = torch.zeros(1, flatdim(offline["FIELDS"]))
     seen[0, [0, 1, offline["L"]]] = 1.0  # slots 0 and 1, and the newcomer
     valid = offline["scored"](offline["new_network"](settings), seen)[0] > -1e5
     assert valid.tolist() == [True, True, *[False] * 6, True, True]

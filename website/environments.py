@@ -177,7 +177,7 @@ def _scenario(id: str) -> Any:
 
 def _make(id: str) -> str:
     if id == FLEET:
-        return "```python\nfrom bufgym.envs import parallel_env\n\nenv = parallel_env(robots=8, capacity=8)\n```"
+        return "```python\nfrom bufgym.envs import FleetEnv\n\nenv = FleetEnv(robots=8, capacity=8)\n```"
     return f'```python\nimport bufgym\nimport gymnasium as gym\n\nenv = gym.make("{id}")\n```'
 
 

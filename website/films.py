@@ -142,9 +142,9 @@ def _fleet() -> Frames:
 
 def _rendered_cell(name: str) -> tuple[str, list[NDArray[np.uint8]]]:
     """A title with how it ends, and images of ``FleetEnv`` while every robot plays this policy."""
-    from bufgym.envs import parallel_env
+    from bufgym.envs import FleetEnv
 
-    env = parallel_env(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="none", render_mode="rgb_array")
+    env = FleetEnv(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="none", render_mode="rgb_array")
     env.reset(seed=1)
     player, senders, ticks = Player(policies.get(name), 8), env.sub_envs.senders, 12 * 30
     shown = set(np.linspace(ticks / _COUNT, ticks, _COUNT).astype(int).tolist())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from bufgym import policies
-from bufgym.envs import parallel_env
+from bufgym.envs import FleetEnv
 from bufgym.envs.expert import Player
 from bufgym.utils.errors import BufgymError
 from website.environments import FLEET, HISTORY, slug
@@ -58,7 +58,7 @@ def image(id: str) -> NDArray[np.uint8]:
     preview = PREVIEWS[id]
     options: dict[str, Any] = dict(preview.options) | {"render_mode": "rgb_array", "info": "none"}
     if id == FLEET:
-        env: Any = parallel_env(**options)
+        env: Any = FleetEnv(**options)
     else:
         env = gym.make(id, actions="slots", **options).unwrapped  # so that any policy can act
     env.reset(seed=preview.seed)

@@ -13,7 +13,7 @@ from agents.held_out import FixedEpisodes, fixed_episodes, split_scenario
 from agents.objectives.objective import Objective
 from agents.report import Report, Trained, by_hand, report_environment
 from bufgym import policies
-from bufgym.oracle import BASELINE
+from bufgym.oracle.measure import BASELINE
 from bufgym.policies import Policy
 from bufgym.sb3 import make_vec_env
 

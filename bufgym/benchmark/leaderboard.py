@@ -25,6 +25,8 @@ from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError, where
 from bufgym.utils.files import read_utf8, write_text
 
+__all__ = ["of_folder", "write"]
+
 COLUMNS: Layout = {
     **{"suite": str, "policy": str, "rank": int, "cells": int, "quantity": str},
     **{"value": float, "low": float, "high": float, "bufgym": str, "made_of": str},

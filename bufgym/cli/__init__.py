@@ -20,7 +20,7 @@ from bufgym.cli.options import OPTIONS
 from bufgym.utils import __version__, modules, packages
 from bufgym.utils.errors import BufgymError, TraceWarning, printable, unknown
 
-__all__ = ["app", "main"]
+__all__ = ["main"]
 
 _formatwarning = warnings.formatwarning
 

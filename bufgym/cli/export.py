@@ -26,8 +26,8 @@ def export(model: str, /, out: str, *, weights: WeightOptions = WeightOptions())
             among candidates.
         out: File to write.
     """
-    from bufgym import sb3
+    from bufgym.sb3 import export as networks
 
     if weights.name is None:
         raise BufgymError("--name must be given: the policy's name")
-    print(f"wrote {sb3.export(model, out, name=weights.name, about=weights.about or '')}")
+    print(f"wrote {networks.export(model, out, name=weights.name, about=weights.about or '')}")

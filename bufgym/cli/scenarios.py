@@ -203,6 +203,7 @@ class ScenarioOptions:
 
 
 def _parameters(options: StreamOptions, *names: str) -> dict[str, Any]:
+    """The scenario's parameters that the user gave by these options, under the scenario's names for them."""
     from bufgym.scenario.checks import names_in
 
     parameters = {_PARAMETERS.get(name, name): value for name, value in given(options, *names).items()}

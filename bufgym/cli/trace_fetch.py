@@ -79,6 +79,7 @@ def _about(dataset: Dataset) -> list[tuple[str, str]]:
 
 
 def _results(fetched: list[Fetched]) -> list[tuple[str, str]]:
+    """(heading, text) of each line about what was fetched, at least one file."""
     origins = Counter(file.origin for file in fetched)
     counts = ", ".join(f"{count} {origin}" for origin, count in origins.items())
     verified = sum(file.known for file in fetched)

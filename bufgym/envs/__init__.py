@@ -1,6 +1,6 @@
 """Environments: a single sender, n of them as one native batch, and robots that share a cell.
 
-``FleetEnv`` and ``parallel_env`` are PettingZoo's and need the extra ``fleet``; the others work without it.
+``FleetEnv`` is PettingZoo's and needs the extra ``fleet``; the others work without it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from bufgym.envs.vector import SenderVectorEnv
 from bufgym.utils.modules import on_demand
 
 if TYPE_CHECKING:
-    from bufgym.envs.fleet import FleetEnv, parallel_env
-    from bufgym.envs.observation import ObservationForm
+    from bufgym.envs.fleet import FleetEnv
 
-__all__ = ["FleetEnv", "FleetVecEnv", "ObservationForm", "SenderEnv", "SenderVectorEnv", "parallel_env"]
+__all__ = ["FleetEnv", "FleetVecEnv", "SenderEnv", "SenderVectorEnv"]
 
 
-__getattr__ = on_demand(__name__, {"FleetEnv": "fleet", "parallel_env": "fleet", "ObservationForm": "observation"})
+__getattr__ = on_demand(__name__, {"FleetEnv": "fleet"})

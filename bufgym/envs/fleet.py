@@ -144,9 +144,7 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
         With "human" it shows that image in the window, as each reset and step does, and returns None.
         """
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() needs a render_mode: parallel_env(..., render_mode='ansi', 'rgb_array' or 'human')"
-            )
+            gym.logger.warn("render() needs a render_mode: FleetEnv(..., render_mode='ansi', 'rgb_array' or 'human')")
             return None
         if self.sub_envs.senders.episodes[0] is None:
             raise gym.error.ResetNeeded("call reset() before render()")
@@ -166,7 +164,3 @@ class FleetEnv(ParallelEnv[str, Observation, int]):
 
     def _infos(self, terminated: bool) -> Infos:
         return {agent: self.sub_envs.info(i, terminated) for i, agent in enumerate(self.possible_agents)}
-
-
-parallel_env = FleetEnv
-"""The name that PettingZoo's tools expect."""

@@ -81,7 +81,7 @@ def write_slots(batch: Batch, function: Any, first: int, flat: NDArray[np.float3
 
 @kernel
 def write_context(batch: Batch, function: Any, first: int, flat: NDArray[np.float32]) -> None:
-    """Write a context field likewise."""
+    """Write a context field into the column ``first``, for each row that waits for a decision."""
     for i in range(len(batch.senders)):
         if batch.senders[i].waiting != NOTHING_WAITS:
             flat[i, first] = function(view(batch, i), last_arrival(batch, i))

@@ -62,10 +62,12 @@ TOPIC = np.dtype(
     align=True,
 )
 
-# A policy's decision is the slot to evict for the newcomer (0 = oldest), or one of these.
-REJECT, ACCEPT = -1, -2
-# A scheduler's choice is the slot to send, or to send nothing until the next arrival or ack.
+REJECT = -1
+"""A policy's decision is the slot to evict for the newcomer (0 = oldest), or to reject the newcomer."""
+ACCEPT = -2
+"""Or to accept the newcomer, which needs room."""
 HOLD = -1
+"""A scheduler's choice is the slot to send, or to send nothing until the next arrival or ack."""
 
 UNLIMITED_BYTES = 2**62
 NO_PARAMETERS: NDArray[np.float64] = np.zeros(0)

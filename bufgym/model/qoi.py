@@ -23,6 +23,8 @@ from bufgym.model.checks import is_number
 from bufgym.utils import modules
 from bufgym.utils.errors import BufgymError
 
+__all__ = ["Value", "exponential"]
+
 EXPONENTIAL, SATURATING, TABULATED = 0, 1, 2
 
 

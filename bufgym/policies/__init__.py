@@ -3,7 +3,7 @@
 import functools
 import os
 
-from bufgym.model.buffer import ACCEPT, HOLD, REJECT, after, before, has_space, is_first
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT, is_first
 from bufgym.policies import (  # noqa: F401  (each registers its policies)
     afr,
     aqm,
@@ -20,13 +20,12 @@ from bufgym.policies import (  # noqa: F401  (each registers its policies)
     target_gap,
     webrtc,
 )
-from bufgym.policies.registry import ClientSettings, Policy, get, names, register, register_later
+from bufgym.policies.registry import Policy, get, names, register, register_later
 from bufgym.policies.schedulers import make_room
 from bufgym.utils import files
 
 __all__ = [
-    "ACCEPT", "HOLD", "REJECT", "ClientSettings", "Policy", "after", "before", "get", "has_space", "is_first", "load",
-    "make_room", "names", "register", "register_later",
+    "ACCEPT", "HOLD", "REJECT", "Policy", "get", "is_first", "load", "make_room", "names", "register",
 ]  # fmt: skip
 
 

@@ -106,7 +106,7 @@ def most_aged(buffer: Buffer, memory: Memory) -> int:
         if is_first(buffer, k):
             slot, topic = buffer.slots[k], topic_of(buffer, buffer.slots[k])
             newest_us = topic.dequeued_arrival_us if topic.dequeued > 0 else slot.arrival_us
-            age = topic.weight * (buffer.now_us - newest_us)
+            age = topic.weight * (buffer.now_us - newest_us)  # weight x us
             if age > most:
                 best, most = k, age
     return best

@@ -105,8 +105,9 @@ Numbers = NDArray[Any]
 
 RATE, SENT_US, PACE, SEEN_US, PERIOD, SQUARE = range(6)
 REMEMBERED = {"rate": 0.0, "sent_us": 0.0, "pace": 0.0, "seen_us": 0.0, "period": 0.0, "square": 0.0}
-"""Memory of the policy: the link's rate over ``link_s`` (bytes/us) and how long it has sent; motion per us
-over ``pace_s`` and how long the stream has run; the mean time between arrivals and its mean square."""
+"""Memory of the policy: the link's ``rate`` over ``link_s``, bytes/us, and how long it has sent, ``sent_us``; ``pace``,
+motion per us over ``pace_s``, and how long the stream has run, ``seen_us``; the mean time between arrivals, ``period``
+in us, and its mean ``square`` in us^2."""
 
 
 @kernel
@@ -118,12 +119,12 @@ def remember(buffer: Buffer, arrival: Arrival, memory: Memory, numbers: Numbers)
     if sent_us > 0:
         memory[RATE] = running_mean(memory[RATE], buffer.drained_bytes, sent_us, memory[SENT_US], 1e6 * numbers[LINK_S])
         memory[SENT_US] += sent_us
-    us = float(arrival.arrival_us - buffer.previous_us)
+    us = float(arrival.arrival_us - buffer.previous_us)  # since the arrival before
     weight = LATE if memory[PERIOD] > 0 else 1.0
     memory[PERIOD] += weight * (us - memory[PERIOD])
-    memory[SQUARE] += weight * (us * us - memory[SQUARE])
+    memory[SQUARE] += weight * (us * us - memory[SQUARE])  # us^2
     if us > 0:
-        step = arrival.x - buffer.previous_x
+        step = arrival.x - buffer.previous_x  # motion
         memory[PACE] = running_mean(memory[PACE], step, us, memory[SEEN_US], 1e6 * numbers[PACE_S])
         memory[SEEN_US] += us
 

@@ -12,12 +12,8 @@
 from bufgym.utils.libraries import needs
 
 with needs(("stable_baselines3", "sb3_contrib", "torch"), "train", "bufgym.sb3"):
-    from bufgym.sb3.export import export, weights_of
-    from bufgym.sb3.networks import SlotExtractor, SlotPolicy, SlotScorer, takes_masks
+    from bufgym.sb3.networks import SlotPolicy
     from bufgym.sb3.policies import as_policy
     from bufgym.sb3.vec_env import GymVecEnv, make_vec_env
 
-__all__ = [
-    "GymVecEnv", "SlotExtractor", "SlotPolicy", "SlotScorer", "as_policy", "export", "make_vec_env", "takes_masks",
-    "weights_of",
-]  # fmt: skip
+__all__ = ["GymVecEnv", "SlotPolicy", "as_policy", "make_vec_env"]

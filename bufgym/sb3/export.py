@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from torch import nn
 
-from bufgym.oracle import EveryLength
+from bufgym.oracle.interruption import EveryLength
 from bufgym.policies import Policy
 from bufgym.policies import weights as files
 from bufgym.policies.candidate_network import CandidateWeights

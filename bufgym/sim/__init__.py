@@ -17,11 +17,8 @@ after a message's last byte has crossed the link. With n_T = 1 and no ack delay 
 Robots that share the link of a cell are senders like all others: only the link differs (``bufgym.sim.shared_link``).
 """
 
-from bufgym.sim.cell import Fleet, run_fleet
-from bufgym.sim.metrics import Outcome, TopicOutcome, outcome, received, topic_outcomes
+from bufgym.sim.metrics import Outcome, outcome
 from bufgym.sim.senders import Senders, run
 from bufgym.sim.state import NEVER
 
-__all__ = [
-    "NEVER", "Fleet", "Outcome", "Senders", "TopicOutcome", "outcome", "received", "run", "run_fleet", "topic_outcomes",
-]  # fmt: skip
+__all__ = ["Outcome", "outcome", "run"]

@@ -26,34 +26,25 @@ if TYPE_CHECKING:
     from bufgym.traces.formats.motions import read_motion, write_motion_csv
     from bufgym.traces.formats.recordings import read_workload, workload_from_bag
     from bufgym.traces.formats.tables import Columns
-    from bufgym.traces.formats.trajectories import read_poses
     from bufgym.traces.formats.workloads import read_workload_csv, write_workload_csv
     from bufgym.traces.formats.writers import WRITERS, difference, write_csv, write_mahimahi
     from bufgym.traces.generate.driving import drive_motion
     from bufgym.traces.generate.lte import synthetic_lte
     from bufgym.traces.generate.markov import markov_link
-    from bufgym.traces.generate.parameters import fitted_links, read_links
+    from bufgym.traces.generate.parameters import read_links
     from bufgym.traces.generate.rules import ramp, steady, tunnel
 
-__all__ = [
-    "FORMATS", "WRITERS", "Columns", "Motion", "MotionSettings", "Poses", "Trace", "Workload",
-    "describe", "detect_format", "difference", "drive_motion", "fitted_links", "load", "load_motion",
-    "markov_link", "motion_from_poses", "ramp", "read_bag", "read_links", "read_motion", "read_poses", "read_trace",
-    "read_workload", "read_workload_csv", "shipped", "steady", "synthetic_lte", "tunnel", "workload_from_bag",
-    "write_csv", "write_mahimahi", "write_motion_csv", "write_workload_csv",
-]  # fmt: skip
+__all__ = ["Trace", "Workload", "load", "read_workload"]
 
 __getattr__ = on_demand(__name__, {
-    "Columns": "formats.tables",
-    "read_bag": "formats.bags", "FORMATS": "formats.links", "detect_format": "formats.links",
-    "read_trace": "formats.links", "read_motion": "formats.motions", "write_motion_csv": "formats.motions",
-    "read_workload": "formats.recordings", "workload_from_bag": "formats.recordings",
-    "read_poses": "formats.trajectories", "read_workload_csv": "formats.workloads",
+    "Columns": "formats.tables", "read_bag": "formats.bags", "FORMATS": "formats.links",
+    "detect_format": "formats.links", "read_trace": "formats.links", "read_motion": "formats.motions",
+    "write_motion_csv": "formats.motions", "read_workload": "formats.recordings",
+    "workload_from_bag": "formats.recordings", "read_workload_csv": "formats.workloads",
     "write_workload_csv": "formats.workloads", "WRITERS": "formats.writers", "difference": "formats.writers",
     "write_csv": "formats.writers", "write_mahimahi": "formats.writers", "drive_motion": "generate.driving",
-    "synthetic_lte": "generate.lte", "markov_link": "generate.markov", "fitted_links": "generate.parameters",
-    "read_links": "generate.parameters", "ramp": "generate.rules", "steady": "generate.rules",
-    "tunnel": "generate.rules",
+    "synthetic_lte": "generate.lte", "markov_link": "generate.markov", "read_links": "generate.parameters",
+    "ramp": "generate.rules", "steady": "generate.rules", "tunnel": "generate.rules",
 })  # fmt: skip
 
 

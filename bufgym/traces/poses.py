@@ -49,14 +49,14 @@ class Poses:
         end_us = self.time_us[-1]
         grid_us = np.rint(np.arange(int(end_us * rate_hz / US_PER_S) + 1) * (US_PER_S / rate_hz)).astype(np.int64)
         grid_us = np.append(grid_us[grid_us < end_us], end_us)
-        parts = [self._beside(part).at(part) for part in np.split(grid_us, range(_PIECE, len(grid_us), _PIECE))]
+        parts = [self._around(part).at(part) for part in np.split(grid_us, range(_PIECE, len(grid_us), _PIECE))]
         position_m, quaternion = (
             np.concatenate(arrays) for arrays in zip(*((p.position_m, p.quaternion) for p in parts), strict=True)
         )
         return Poses(grid_us, position_m, quaternion, self.format)
 
-    def _beside(self, time_us: Int64Array) -> Poses:
-        """The poses from the one before the first of these times to the one after the last, of norm 1."""
+    def _around(self, time_us: Int64Array) -> Poses:
+        """The poses between which all of ``time_us``, int64[m] rising, lie; their quaternions have norm 1."""
         start = min(int(np.searchsorted(self.time_us, time_us[0], side="right")) - 1, self.time_us.size - 2)
         end = int(np.searchsorted(self.time_us, time_us[-1], side="right")) + 1
         part = slice(start, end)

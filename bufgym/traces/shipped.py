@@ -56,9 +56,15 @@ def load(
     columns: Columns | None = None,
     holes: Holes = "hold",
 ) -> Trace:
-    """A bandwidth trace by its shipped name, from a file (see `read_trace`), or of one rate, as in `20Mbit/s`.
+    """A bandwidth trace by its shipped name, from a file, or of one rate, as in `20Mbit/s`.
 
-    A shipped name takes precedence, then a file.
+    Args:
+        name_or_path: a shipped name takes precedence, then a file, plain or gzip'd.
+        format: of the file (docs/guide/recordings.md lists them); by default it is detected from the content.
+        after: as in `Trace`.
+        column: the one to read, where a format has several; see `read_trace`.
+        columns: of any other table, which columns hold time and rate; without `format` and `column`.
+        holes: in a stretch without samples "hold" the rate before it, send nothing ("zero"), or "refuse" the file.
     """
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:

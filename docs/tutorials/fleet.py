@@ -1,13 +1,13 @@
 # %% [markdown]
 # # 8. A fleet
 #
-# Many robots in one cell share its uplink: what one sends is missing for the others. `parallel_env` is PettingZoo's
+# Many robots in one cell share its uplink: what one sends is missing for the others. `FleetEnv` is PettingZoo's
 # interface; it needs the extra `fleet`.
 
 # %%
-from bufgym.envs import parallel_env
+from bufgym.envs import FleetEnv
 
-env = parallel_env(robots=4, capacity=8, duration_s=10.0, reward="team")
+env = FleetEnv(robots=4, capacity=8, duration_s=10.0, reward="team")
 observations, infos = env.reset(seed=0)
 print(env.agents)
 

@@ -48,9 +48,9 @@ bufgym([*command.split(), "--seeds", "40", "--capacity", "20", "--jobs", "1", "-
 # sums them up, with an [interval](../guide/suites.md#intervals-and-shares) over episodes.
 
 # %%
-from bufgym.benchmark import leaderboard
+from bufgym.benchmark.leaderboard import of_folder
 
-board = leaderboard.of_folder(folder / "rows")
+board = of_folder(folder / "rows")
 board.sort(key=lambda entry: -entry.values["score"].value)
 for entry in board:
     score = entry.values["score"]

@@ -33,34 +33,35 @@ print(recording.topics, len(recording), "messages")
 print(f"{uplink.mean_bytes_per_s / 1e6:.2f} MB/s on average")
 
 # %% [markdown]
-# From the command line the same is
+# ## What would it have dropped?
+#
+# The command is
 #
 # ```
 # bufgym bench --workload drive.csv --trace uplink.csv --policies min-gap,afr,drop-oldest --drops dropped.csv
 # ```
 #
-# ## What would it have dropped?
+# Here it is called from Python. Its last table has the share of each topic that each policy dropped.
 
 # %%
-from bufgym import policies
-from bufgym.benchmark import drops
-from bufgym.scenario import Uplink
+from bufgym.cli import main as bufgym_command
 
-scenario = Uplink((uplink,), workload=recording, random_offset=False)
-names = ["min-gap", "afr", "drop-oldest"]
-dropped = drops.drops([policies.get(name) for name in names], scenario, [8], seeds=1)
-counts = drops.write_drops(dropped, Path("dropped.csv"))
-print(drops.by_topic(counts, scenario, names, runs=1))
+command = "bench --workload drive.csv --trace uplink.csv --policies min-gap,afr,drop-oldest --drops dropped.csv"
+bufgym_command(command.split())
 print(Path("dropped.csv").read_text().splitlines()[:3])
 
 # %% [markdown]
 # ## The picture
+#
+# `bufgym.compare` plays the same runs, and its result draws them.
 
 # %%
 import bufgym
+from bufgym.model import qoi
+from bufgym.scenario import Uplink
 
-compared = bufgym.compare(names, scenario, seeds=1, about="My drive over my link")
-print(compared)
+scenario = Uplink((uplink,), workload=recording, random_offset=False, value=qoi.exponential(0.618))
+compared = bufgym.compare(["min-gap", "afr", "drop-oldest"], scenario, seeds=1, about="My drive over my link")
 compared.plot().figure.savefig("own-recording.png")
 
 # %% [markdown]

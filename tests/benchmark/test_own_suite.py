@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from cli_cases import Capsys, Patch, shown
+from needs import needs
 from refusal_cases import refused
 from sweep_cases import contents, ended, interrupt
 
@@ -72,7 +73,7 @@ def test_estimates_are_the_tables_numbers_and_latex_has_them() -> None:
 
 
 def test_a_frame_of_estimates() -> None:
-    pytest.importorskip("pandas")
+    pytest.importorskip("pandas", reason=needs("extras", "pandas"))
     frame = bufgym.compare("afr", "interruption", seeds=2, progress=False).to_pandas("estimates")
     assert [*frame] == ["policy", "scenario", "capacity", "quantity", "estimate", "low", "high"]
 

@@ -13,11 +13,12 @@ from needs import needs
 from refusal_cases import refuse, refused
 
 import bufgym
-from bufgym import oracle, policies
+from bufgym import policies
 from bufgym.benchmark import run
 from bufgym.benchmark.rows import RUNS, Row, read_rows, write_rows
 from bufgym.benchmark.tasks.queue import QueueTask, row_to_show
 from bufgym.model import qoi
+from bufgym.oracle.interruption import integer
 from bufgym.policies import Policy
 from bufgym.scenario import Interruption, Uplink, numbered
 from bufgym.traces import Trace
@@ -78,7 +79,7 @@ def test_an_interruption_has_a_bound_and_a_regret() -> None:
         (row,) = run.run([policies.get("drop-oldest")], scenario, [1], 1, label="short")
         assert list(row) == list(RUNS)
         assert (row["scenario"], row["trace"]) == ("short", "interruption")
-        assert row["clairvoyant"] == best == 1 + oracle.integer(1, 3, v)
+        assert row["clairvoyant"] == best == 1 + integer(1, 3, v)
         assert row["certified"] is True
         assert row["regret"] == pytest.approx(regret)
         assert (row["arrived"], row["delivered"], row["dropped"]) == (5, 3, 2)

@@ -35,17 +35,24 @@ class Pipe:
 
 
 class ZenohDrop(Policy):
-    settings = {"batch_size": 65_535, "queue_size": 2, "so_sndbuf": 131_072, "wait_before_drop": 1_000}
-    settings |= {"max_wait_before_drop_fragments": 50_000, "rate_memory_s": 1}
+    """Zenoh's dropping of what would wait too long; batches and buffers in bytes, waits in us."""
 
-    def __init__(self, **given):
-        self.batch, queued, buffered, self.wait, self.more, memory_s = {**self.settings, **given}.values()
-        self.room, self.pipe = queued * self.batch + 2 * buffered, Pipe(memory_s)
+    def __init__(
+        self,
+        batch_size=65_535,
+        queue_size=2,
+        so_sndbuf=131_072,
+        wait_before_drop=1_000,
+        max_wait_before_drop_fragments=50_000,
+        rate_memory_s=1,
+    ):
+        self.batch_bytes, self.wait_us, self.more_us = batch_size, wait_before_drop, max_wait_before_drop_fragments
+        self.room_bytes, self.pipe = queue_size * batch_size + 2 * so_sndbuf, Pipe(rate_memory_s)
 
     def deadlines(self):
-        """wait (1 + 2 + 4 + ...), the first left as it is and the others cut at ``more`` in all."""
+        """wait_us (1 + 2 + 4 + ...), the first left as it is and the others cut at ``more_us`` in all."""
         for k in itertools.count():
-            yield self.wait + min(self.more, self.wait * (2 ** (k + 1) - 2))
+            yield self.wait_us + min(self.more_us, self.wait_us * (2 ** (k + 1) - 2))
 
     def decide(self, queue, newcomer):
         ahead = self.pipe.look(queue, self.sender, newcomer["us"])
@@ -57,8 +64,8 @@ class ZenohDrop(Policy):
             if put == size:
                 self.pipe.note(ahead + size, size)
                 return ACCEPT
-            more = min(put + self.batch, size)
-            if self.pipe.rate is not None and ahead + more - self.pipe.rate * deadline > self.room:
+            more = min(put + self.batch_bytes, size)
+            if self.pipe.rate is not None and ahead + more - self.pipe.rate * deadline > self.room_bytes:
                 self.pipe.note(ahead + put, 0)
                 return REJECT
             put = more

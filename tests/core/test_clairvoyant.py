@@ -17,8 +17,9 @@ from bufgym.jit import JIT
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES
 from bufgym.model.link import Link
-from bufgym.oracle import beam, cached, clairvoyant, integer, labels, pieces, programme, unequal
+from bufgym.oracle import beam, cached, clairvoyant, labels, pieces, programme, unequal
 from bufgym.oracle.clairvoyant import Plan
+from bufgym.oracle.interruption import integer
 from bufgym.scenario import Episode, Interruption, messages
 from bufgym.scenario.numbered import draw
 from bufgym.sim import run

@@ -14,7 +14,8 @@ from refusal_cases import refused
 from bufgym import scenario, traces
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
-from bufgym.scenario import Client, Stream, Streams, read_client, robofleet_example
+from bufgym.scenario import Client, Stream, Streams, read_client
+from bufgym.scenario.client import robofleet_example
 from bufgym.utils.errors import BufgymError
 
 LINK = traces.Trace.constant(1e6, 60.0, name="1 MB/s")

@@ -14,8 +14,9 @@ from refusal_cases import refuse
 from bufgym import policies
 from bufgym.model import qoi
 from bufgym.model.link import Link
-from bufgym.oracle import OnlineOptimum, ideal, integer, law, online_optimum
-from bufgym.oracle.interruption import by_length
+from bufgym.oracle import law, online_optimum
+from bufgym.oracle.interruption import by_length, ideal, integer
+from bufgym.oracle.online import OnlineOptimum
 from bufgym.policies import ACCEPT, REJECT, Policy
 from bufgym.scenario import Episode, Interruption, Streams, messages, registry
 from bufgym.sim import run

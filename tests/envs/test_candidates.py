@@ -207,7 +207,7 @@ def test_a_rule_plays_among_candidates() -> None:
     envs = batch_of(EQUAL, 3, capacity=5, info="mask")
     episodes = [draw(EQUAL, seed) for seed in range(3)]
     envs.reset(options={"episodes": episodes})
-    rule, qoi_at_end = expert.PolicyExpert(envs, "min-motion-gap"), np.zeros(3)
+    rule, qoi_at_end = expert.policy(envs, "min-motion-gap"), np.zeros(3)
     over = np.zeros(3, np.bool_)
     while not over.all():
         actions = rule.actions()

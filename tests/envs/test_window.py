@@ -95,7 +95,7 @@ def test_of_many_rows_the_first_sixteen_are_shown(waits: list[float]) -> None:
 
 def test_a_fleet_is_shown(waits: list[float]) -> None:
     pytest.importorskip("pettingzoo", reason=needs("extras", "pettingzoo"))
-    seen, drawn = (bufgym.envs.parallel_env(robots=2, duration_s=2.0, render_mode=m) for m in ("human", "rgb_array"))
+    seen, drawn = (bufgym.envs.FleetEnv(robots=2, duration_s=2.0, render_mode=m) for m in ("human", "rgb_array"))
     for env in (seen, drawn):
         env.reset(seed=1)
         env.step(dict.fromkeys(env.agents, 0))

@@ -29,8 +29,8 @@ LOOSER = {"solis-wifi": (0.0, 0.01, 4e-3, 0.6), "belgium-4g-sabre": (0.125, 0.0,
 LEAST_WITHOUT_LINES_OF_NO_LENGTH = {"wifi_cafe_231115-154511": 45.0, "wifi_restr_231115-134450": 42.5}
 
 
-def table(data_set: str) -> dict[str, dict[str, float]]:
-    """Trace -> its numbers."""
+def stated(data_set: str) -> dict[str, dict[str, float]]:
+    """What STATS.csv states of each trace of a data set: trace -> column (such as mean_KBps) -> number."""
     with open(DATA / "STATS.csv", newline="") as file:
         rows = {row.pop("trace"): row for row in csv.DictReader(file) if row.pop("set") == data_set}
     return {name: {key: float(value) for key, value in row.items()} for name, row in rows.items()}
@@ -38,7 +38,7 @@ def table(data_set: str) -> dict[str, dict[str, float]]:
 
 def compare(data_set: str, traces: dict[str, Trace], looser: tuple[float, ...] = (0,) * 4) -> None:
     rates, extremes, mean, s = looser
-    rows = table(data_set)
+    rows = stated(data_set)
     for name, trace in traces.items():
         summary, expected = describe(trace), rows[name]
         expected["min_KBps"] = LEAST_WITHOUT_LINES_OF_NO_LENGTH.get(name, expected["min_KBps"])
@@ -70,7 +70,7 @@ def test_the_recordings_of_the_tests_agree_with_the_table(name: str) -> None:
 def test_recorded_links_agree_with_the_table(name: str) -> None:
     data_set, pattern, format = SETS[name]
     traces = read(fetched(name).glob(pattern), format)
-    assert sorted(traces) == sorted(table(data_set))
+    assert sorted(traces) == sorted(stated(data_set))
     compare(data_set, traces, LOOSER.get(name, (0,) * 4))
 
 
@@ -78,7 +78,7 @@ def test_recorded_links_agree_with_the_table(name: str) -> None:
 def test_logs_of_belgium_agree_with_the_table(shared_data: Path) -> None:
     """A raw log and its CSV are one trace."""
     traces = read((shared_data / "belgium_4g" / "csv").glob("*.csv"), "csv")
-    assert sorted(traces) == sorted(table("belgium_4g"))
+    assert sorted(traces) == sorted(stated("belgium_4g"))
     compare("belgium_4g", traces)
     raw = read((shared_data / "belgium_4g" / "raw").glob("*.log"), "belgium")
     assert raw == {name: traces[name] for name in raw} != {}
@@ -89,7 +89,7 @@ def test_every_file_of_the_ucc_archive(tmp_path: Path) -> None:
     unpack(fetched("ucc-5g") / "5G-production-dataset.zip", tmp_path / "ucc")
     traces = {str(path): read_trace(path) for path in (tmp_path / "ucc").rglob("*.csv")}
     downloads = {"/".join(m.split("/")[-2:]): trace for m, trace in traces.items() if "/Download/" in m}
-    assert sorted(downloads) == sorted(table("ucc_5g_download"))
+    assert sorted(downloads) == sorted(stated("ucc_5g_download"))
     compare("ucc_5g_download", downloads)
 
 
@@ -98,7 +98,7 @@ def test_every_line_of_mahimahi_is_a_packet() -> None:
     folder = fetched("mahimahi")
     paths = [path for end in ("up", "down", "up.gz", "down.gz") for path in folder.glob(f"*.{end}")]
     traces = {path: read_trace(path) for path in paths}
-    assert {trace.name for trace in traces.values()} >= set(table("mahimahi"))
+    assert {trace.name for trace in traces.values()} >= set(stated("mahimahi"))
     for path, trace in traces.items():
         raw = path.read_bytes()
         lines = (gzip.decompress(raw) if path.suffix == ".gz" else raw).split()

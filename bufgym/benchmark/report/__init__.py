@@ -24,8 +24,6 @@ from bufgym.utils import __version__
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import write_text
 
-__all__ = ["markdown", "page_of_rows", "page_of_run", "run_of", "write"]
-
 
 def write(folder: str | Path) -> Path:
     """Write the page of a run as ``report.html`` into its folder; return its path.

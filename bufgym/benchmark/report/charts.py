@@ -232,6 +232,7 @@ def _regret_curves(
 
 
 def regret_title(cells: Iterable[CellScore]) -> str:
+    """The heading of regret, which says "at most" where a bound of a cell is not exact."""
     return "regret" if all(cell.exact for cell in cells) else REGRET_AT_MOST
 
 

@@ -8,12 +8,13 @@
 the environment is in when it is asked.
 """
 
-from bufgym.envs.expert import dataset
 from bufgym.envs.expert.experts import PolicyExpert, online
 from bufgym.envs.expert.hindsight import Clairvoyant
 from bufgym.envs.expert.player import Player
 
-clairvoyant, policy = Clairvoyant, PolicyExpert
-"""The expert that knows the whole episode, and any policy as one, named like the others."""
+clairvoyant = Clairvoyant
+"""``clairvoyant(env)`` knows the whole episode: ``actions()`` [n], ``values()`` and ``regrets()`` [n, actions]."""
+policy = PolicyExpert
+"""``policy(env, "afr")`` makes an expert of a policy: ``actions()`` [n]."""
 
-__all__ = ["Clairvoyant", "Player", "PolicyExpert", "clairvoyant", "dataset", "online", "policy"]
+__all__ = ["Player", "clairvoyant", "online", "policy"]

@@ -156,7 +156,7 @@ def make(
         raise BufgymError(f"kind = {kind!r}: must be one of {', '.join(KINDS)}")
     name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"
     root = _folder_for(name, out)
-    single = _recoverable(env, options)
+    single = _environment_of(env, options)
     batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
     recorded = record(batch, kind, episodes, medium=medium, seed=seed, regret=regret)
     players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
@@ -180,8 +180,12 @@ def _folder_for(name: str, out: str | Path | None) -> Path:
     return root
 
 
-def _recoverable(env: str, options: dict[str, Any]) -> Any:
-    """The single environment, whose options a data set can store."""
+def _environment_of(env: str, options: dict[str, Any]) -> Any:
+    """Make the single environment that Minari stores with a data set, so that its readers can make it again.
+
+    Raises:
+        BufgymError: an option has no form in JSON.
+    """
     single = gym.make(env, **options)
     try:
         cast(Any, single.spec).to_json()

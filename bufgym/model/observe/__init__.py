@@ -42,11 +42,4 @@ from bufgym.model.observe.topics import (
     observe_topic_slots,
 )
 
-__all__ = [
-    "BUILT_IN", "CANDIDATE_FIELDS", "CONTEXT_FIELDS", "FIELDS", "ON_BOARD_FIELDS", "ON_BOARD_SLOT_FIELDS",
-    "OWN_FIELDS", "OWN_TERMS", "PAST_FIELDS", "QUEUE_FIELDS", "REWARD_TERMS", "SLOT_FIELDS", "TOPIC_CONTEXT_FIELDS",
-    "TOPIC_FIELDS", "TOPIC_REWARD_TERMS", "TOPIC_SLOT_FIELDS", "Chosen", "Field", "OwnTerm", "RewardTerm",
-    "chosen_at", "decision_of_candidate", "field", "find_candidates", "is_offered", "observe", "observe_candidates",
-    "observe_on_board", "observe_on_board_slots", "observe_topic_context", "observe_topic_slots", "own_field",
-    "own_term", "reward_term", "terms_for", "write_chosen", "write_chosen_on_board",
-]  # fmt: skip
+__all__ = ["field", "reward_term"]

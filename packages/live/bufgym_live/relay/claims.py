@@ -78,7 +78,7 @@ class Claims:
             del self._sessions[next(iter(self._sessions))]
 
     def elsewhere(self, robot: str, relay: str, address: str) -> None:
-        """Warn if a robot that another relay has is here, too."""
+        """Warn if a robot that is at another ``relay``, from ``address``, is connected here, too."""
         session = self._sessions.get(robot)
         if session is not None and session.away_s == math.inf and self._clock() - session.heard_s < SILENT_S:
             self._warn(robot, f"two robots have this name: one at {address}, at relay {relay}", session.identity)

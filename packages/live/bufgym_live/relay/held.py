@@ -236,7 +236,7 @@ class Held:
                 session.answers.pop(number, None)
 
     def deny(self, session: StoredSession, number: int, why: str) -> None:
-        """Drop a message that the session must not have any more."""
+        """Drop the message of this number, which the session must not have any more; ``why`` is its answer."""
         session.answers[number] = why
         with self.bearable():
             self._settle(session, number, number, 1)

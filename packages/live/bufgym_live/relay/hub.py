@@ -186,12 +186,12 @@ class Hub:
         """Count a message, and show it to the relay's own parts."""
         self.received += 1
         for each in self.own:
-            with self.spared(type(each).__name__):
+            with self.outliving(type(each).__name__):
                 each(message)
 
     @contextmanager
-    def spared(self, part: str) -> Iterator[None]:
-        """Log the first fault of each kind in a part of the relay, without which the rest goes on."""
+    def outliving(self, part: str) -> Iterator[None]:
+        """Run a ``part`` of the relay whose faults end nothing else; the first of each kind is logged."""
         try:
             yield
         except Exception as error:
@@ -334,7 +334,7 @@ class Hub:
         """Finish the files."""
         self.drivers.tick(quiet_s=0.0)
         for each in self.own:
-            with self.spared(type(each).__name__):
+            with self.outliving(type(each).__name__):
                 each.close()
         self.store.close()
         self.audit.close()

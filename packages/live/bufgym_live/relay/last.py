@@ -17,8 +17,8 @@ class Last:
     def __init__(self, audit: Audit) -> None:
         self._audit = audit
         self._messages: dict[str, Outgoing] = {}
-        self._owners: dict[str, str] = {}
-        self._bytes: Counter[str] = Counter()
+        self._owners: dict[str, str] = {}  # topic -> owner
+        self._bytes: Counter[str] = Counter()  # owner -> bytes of all its last messages
 
     def items(self) -> ItemsView[str, Outgoing]:
         return self._messages.items()

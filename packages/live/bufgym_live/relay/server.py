@@ -233,7 +233,7 @@ class Server:
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
-            with self.hub.spared("tick"):
+            with self.hub.outliving("tick"):
                 began_s = turns.clock()
                 self.hub.tick()
                 self.hub.turns.note("tick", began_s)

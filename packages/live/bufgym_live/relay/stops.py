@@ -47,7 +47,7 @@ class Stops:
                 await send(wire.encode(dated))
 
     def confirm(self, topic: str, id: str) -> None:
-        """Note that the relay has one."""
+        """Note that the relay has the message ``id`` of ``topic``, and wake who waits for that."""
         for number, (message, _, answered) in list(self._waiting.items()):
             if message.topic == topic and f'"id":"{id}"'.encode() in message.payload:
                 del self._waiting[number]

@@ -209,10 +209,16 @@ class Sender:
             self._leave(item)
 
     async def _an_ack(self) -> None:
+        """Wait until the next ack has come."""
         self._acked.clear()
         await self._acked.wait()
 
     async def _take_acks(self, channel: Channel) -> None:
+        """Read acks for ever: of latched messages by number, of the others in the order in which they were sent.
+
+        Raises:
+            FrameError: the other end sent anything else.
+        """
         while True:
             frame = await channel.receive()
             if frame.kind == LATCHED:
@@ -225,10 +231,12 @@ class Sender:
             self._take_ack()
 
     def _take_ack(self) -> None:
+        """Let the oldest unacked message go, and wake who waits for an ack."""
         self._leave(self._unacked.popleft())
         self._acked.set()
 
     def _leave(self, item: Item) -> None:
+        """Tell the queue once that a message has left, so that it gives the next."""
         if item.number >= self._left:
             self._left = item.number + 1
             self.queue.gone()

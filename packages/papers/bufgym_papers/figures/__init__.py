@@ -17,8 +17,6 @@ from bufgym.utils.errors import BufgymError, unknown
 from bufgym_papers.figures.figure import Figure, report, save_picture, statements
 from bufgym_papers.figures.rows import FigureRows
 
-__all__ = ["FIGURES", "NEEDS_DATA", "TAKES_DATA", "figure", "run", "run_live"]
-
 FIGURES: dict[str, str] = {name: texts["title"] for name, texts in statements().items() if "title" in texts}
 """Name of a figure -> its title."""
 

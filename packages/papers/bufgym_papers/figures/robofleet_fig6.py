@@ -61,6 +61,7 @@ class Reproduction(ClientFigure):
         return self.mbit_per_s * MBIT / (self.rate_hz * cloud_bytes(points)[0])
 
     def tables(self, rows: FigureRows) -> list[str]:
+        """For each size of cloud what the link carries, then mean latency (s) and received shares by consumers."""
         lines: list[str] = []
         for points in self.points:
             ros, flatbuffer, _ = cloud_bytes(points)
@@ -77,6 +78,7 @@ class Reproduction(ClientFigure):
         return lines[:-1]
 
     def latencies_s(self, rows: FigureRows, points: int, line: str) -> list[float]:
+        """Mean latency of a line for 1, 2, ... consumers."""
         shown = rows.where(points=points, line=line)
         return [shown.mean("mean_latency_s", consumers=n) for n in range(1, self.max_consumers + 1)]
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:  # the command says first whether policies run compiled, and t
     from bufgym.traces import MotionSettings
     from bufgym_live.robot.odometry import Odometry
 
-__all__ = ["UNTOUCHED", "install"]
-
 UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
 """Small topics that every node reads. A policy named for one of them still rules it."""
 _ROOM: Final = 4096  # size of a queue's bookkeeping, half a MB for each subscriber
