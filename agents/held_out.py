@@ -21,8 +21,7 @@ from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import REFERENCE, CellScore, scores
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.oracle import normalised_score
-from bufgym.oracle.measure import BASELINE, regret
+from bufgym.oracle import BASELINE, normalised_score, regret
 from bufgym.policies import Policy, registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.scenario.numbered import draw
@@ -37,10 +36,10 @@ FIRST_SEED = {"validation": 2_000_000_000, "test": 1_000_000_000}
 
 
 @functools.cache
-def generated(first: int = FIRST_LINK, count: int = GENERATED) -> tuple[Trace, ...]:
-    """Links of the shipped ones' modes and means, by turns, with seeds from ``first`` on."""
-    kinds = [SHIPPED_LTE[k % len(SHIPPED_LTE)] for k in range(count)]
-    return tuple(synthetic_lte(first + k, SHIPPED_DURATION_S, mean, mode) for k, (mode, mean) in enumerate(kinds))
+def generated() -> tuple[Trace, ...]:
+    """Links of the shipped ones' modes and means, by turns."""
+    kinds = [SHIPPED_LTE[k % len(SHIPPED_LTE)] for k in range(GENERATED)]
+    return tuple(synthetic_lte(FIRST_LINK + k, SHIPPED_DURATION_S, mean, mode) for k, (mode, mean) in enumerate(kinds))
 
 
 def split_scenario(on: Environment) -> tuple[Scenario, Scenario]:

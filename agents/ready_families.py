@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 
 from agents.families import Run, run_of
-from agents.held_out import generated, split_scenario
+from agents.held_out import split_scenario
 from agents.mixed_env import Cell
 from agents.tasks import Environment
 from bufgym.model import qoi
 from bufgym.scenario import Uplink, suites
 from bufgym.scenario.numbered import by_trace
-from bufgym.scenario.suites.synthetic import blackout_link, lte_links
 from bufgym.scenario.uplink import uplink_over_lte
 from bufgym.traces import Trace, drive_motion, markov_link, synthetic_lte
 
@@ -35,8 +34,6 @@ UPLINKS = ("uplink-5g-v1", "uplink-wifi-v1", "uplink-mmwave-v1")
 """Suites over recorded uplinks."""
 FRAMES = {"train": 96, "validation": 24, "test": 48}
 """Generated links at the default frames."""
-WIDE = 192
-"""Links in training in place of a suite's few: with 48 an agent learned them by heart, and grew worse on others."""
 STREAMS = {"train": 96, "validation": 48, "test": 96}
 """Streams of random conditions; three in four have messages of equal size."""
 FIRST_EPISODE = {"validation": 100_000, "test": 200_000}
@@ -91,10 +88,7 @@ def random_stream(seed: int) -> Cell:
 
 def _task(split: str, data: str | None = None) -> list[Cell]:
     on = Environment()
-    scenario = split_scenario(on)[split == "test"]
-    if split == "train":
-        scenario = replace(scenario, traces=(*scenario.traces, *generated(FIRST_SEED[split], WIDE)))
-    return [Cell("", scenario, on.capacity)]
+    return [Cell("", split_scenario(on)[split == "test"], on.capacity)]
 
 
 def _frames(split: str, data: str | None = None) -> list[Cell]:
@@ -121,53 +115,32 @@ def _uplinks(split: str, data: str | None = None) -> list[Cell]:
     return [cell for name in names for cell in _of_suite(name, (5, 15))(split, data)]
 
 
-def _of_suite(
-    suite: str, capacities: Sequence[int], label: str = "", links: Callable[[str], Sequence[Trace]] | None = None
-) -> Callable[..., list[Cell]]:
-    """Cells of a suite whose label has this in it, with messages of equal size and no limit on bytes.
-
-    ``links`` makes those to train on from a label.
-    """
+def _of_suite(suite: str, capacities: Sequence[int], label: str = "") -> Callable[..., list[Cell]]:
+    """Cells of a suite whose label has this in it, with messages of equal size and no limit on bytes."""
 
     def made(split: str, data: str | None = None) -> list[Cell]:
         found = {name: s for name, s in suites.get(suite).settings(split, data).items() if label in name}
         kept = {name: s.scenario for name, s in found.items() if s.max_bytes is None}
-        chosen = {name: s for name, s in kept.items() if getattr(s, "sizes", "equal") == "equal"}
-        if split == "train":
-            chosen = {name: _widened(name, s, links) for name, s in chosen.items()}
+        chosen = {name: _moved(s, split) for name, s in kept.items() if getattr(s, "sizes", "equal") == "equal"}
         return [Cell(name, scenario, L) for name, scenario in chosen.items() for L in capacities]
 
     return made
 
 
-def _widened(label: str, scenario: Any, links: Callable[[str], Sequence[Trace]] | None) -> Any:
-    """With many links and drives in place of a suite's few."""
-    first = FIRST_SEED["train"]
-    if scenario.motion and all(motion.name.startswith("drive") for motion in scenario.motion):
-        scenario = replace(scenario, motion=tuple(drive_motion(first + k) for k in range(FRAMES["train"])))
-    return scenario if links is None else replace(scenario, traces=tuple(links(label)))
-
-
-def _lte(label: str) -> Sequence[Trace]:
-    return lte_links(FIRST_SEED["train"], WIDE, (3e6, 5e6, 7e6, 9e6))
-
-
-def _like_recorded(label: str) -> Sequence[Trace]:
-    return [markov_link(MOVING[k % 6], FIRST_SEED["train"] + k) for k in range(WIDE)]
-
-
-def _blackouts(label: str) -> Sequence[Trace]:
-    """Of as many seconds as the label says: outage-5s."""
-    seconds = int(label.removeprefix("outage-").removesuffix("s"))
-    return [blackout_link(FIRST_SEED["train"] + k, seconds) for k in range(WIDE // 4)]
+def _moved(scenario: Any, split: str) -> Any:
+    """With many drives in place of a suite's few, where it trains: a network sees how its camera moves."""
+    is_made_up = all(motion.name.startswith("drive") for motion in getattr(scenario, "motion", ()))
+    if split != "train" or not getattr(scenario, "motion", ()) or not is_made_up:
+        return scenario
+    return replace(scenario, motion=frames_over(range(FIRST_SEED[split], FIRST_SEED[split] + FRAMES[split])).motion)
 
 
 FAMILIES: dict[str, Callable[..., list[Cell]]] = {
     "task": _task,
     "frames": _frames,
-    "lte": _of_suite("lte-v2", (5, 8, 15), links=_lte),
-    "generated": _of_suite("generated-v2", (5, 15), links=_like_recorded),
-    "outage": _of_suite("outage-v1", (5, 15), links=_blackouts),
+    "lte": _of_suite("lte-v2", (5, 8, 15)),
+    "generated": _of_suite("generated-v2", (5, 15)),
+    "outage": _of_suite("outage-v1", (5, 15)),
     "heavy": _of_suite("jpeg-v1", (5, 10, 25), "heavy"),
     "light": _of_suite("jpeg-v1", (5, 10, 25), "light"),
     "random": _random,

@@ -32,7 +32,7 @@ from studies.page import command, publish
 SHIPPED = Path("agents/pretrained/learned.safetensors")
 FOLDER = Path("runs/judged")
 """Where bounds and the planner's runs are kept."""
-TRAINING = "python train.py hindsight --families all --data DIR --steps 3000000 --seed 1"
+TRAINING = "python train.py hindsight --families all --data DIR --steps 4000000 --seed 1"
 
 PAGE = """# learned
 

@@ -101,7 +101,7 @@ def _outage(split: str, data: Path) -> dict[str, Setting]:
     settings = {}
     for outage_s in OUTAGES_S:
         whole_s = outage_s + _AROUND_S
-        traces = tuple(blackout_link(FIRST_SEED[split] + k, outage_s) for k in range(TRACES[split] // 3))
+        traces = tuple(_blackout(FIRST_SEED[split] + k, outage_s) for k in range(TRACES[split] // 3))
         moving = camera(traces=traces, motion=motions_of(split), value=motion_value())
         scenario = replace(moving, duration_s=float(whole_s), link_offset_s=(0.0, 10.0))
         about = f"one blackout of {outage_s} s within {whole_s} s; x is the camera's motion"
@@ -109,7 +109,7 @@ def _outage(split: str, data: Path) -> dict[str, Setting]:
     return settings
 
 
-def blackout_link(seed: int, outage_s: int) -> Trace:
+def _blackout(seed: int, outage_s: int) -> Trace:
     """A good LTE link (mean 12 MB/s) of 75 s that stands still from its 30th second on for ``outage_s`` seconds."""
     lengths_us, rates = synthetic_lte(seed, _AROUND_S + 15, mean_bytes_per_s=12e6).samples()
     steps = [(float(us) / 1e6, float(rate)) for us, rate in zip(lengths_us, rates, strict=True)]
