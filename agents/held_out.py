@@ -21,7 +21,8 @@ from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, times_drawn
 from bufgym.benchmark.rows import Row
 from bufgym.benchmark.score import REFERENCE, CellScore, scores
 from bufgym.benchmark.tasks import QueueTask
-from bufgym.oracle import BASELINE, normalised_score, regret
+from bufgym.oracle import normalised_score
+from bufgym.oracle.measure import BASELINE, regret
 from bufgym.policies import Policy, registry
 from bufgym.scenario import Scenario, Uplink
 from bufgym.scenario.numbered import draw

@@ -47,8 +47,8 @@ the rule `gap-price`. It was made by `{made}`{seed}.
 - *Does* one of {actions} actions: accept, or drop the cheapest where there is no room; drop one of the candidates or
   the head; do what `gap-price` does. It is asked at every arrival, and takes the action with the highest output among
   the actions that are offered.
-- *Leaves to the rule* steady links whose rate has not changed by 10 % for {even:.0f} seconds, queues of one or two
-  places, messages in bursts or of unequal bytes, and a V that saturates.
+- *Leaves to the rule* steady links whose rate has not changed by 10 % for {even:.0f} seconds, messages in bursts or of
+  unequal bytes, and a V that saturates.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
 - *Falls short* of a rule, on a row below, by an interval without zero: {short}.
 - *Trained* on {families} families of links and streams at once. [Training](../docs/guide/training.md) says how.

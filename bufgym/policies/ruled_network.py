@@ -85,12 +85,12 @@ def even(buffer: Buffer) -> bool:
 def left_to_rule(buffer: Buffer, memory: Memory) -> bool:
     """Whether the rule alone decides: what hindsight says there teaches nothing.
 
-    On an even link, in a queue of one or two places, in bursts, where V saturates and where sizes differ, accepting is
+    On an even link, in bursts, where V saturates and where sizes differ, accepting is
     free in hindsight, as the clairvoyant could still drop the right messages later; who accepts does not.
     """
     rule, is_saturating = memory[RULE:], buffer.v[0] == SATURATING
     is_unequal = price_dp.share(rule, BASE) > 0
-    return bool(buffer.capacity <= 2 or is_saturating or is_unequal or bursty(rule) or even(buffer))
+    return bool(is_saturating or is_unequal or bursty(rule) or even(buffer))
 
 
 @kernel
