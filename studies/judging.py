@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,6 +82,33 @@ def judged(name: str, runs: Sequence[Run], rivals: Mapping[str, Policy]) -> Judg
     if name in BY_CAPACITY:
         return Judged(parts, [])
     return Judged([row(name, np.ones(len(runs), bool))], parts if len(parts) > 1 else [])
+
+
+TOLD = ("task", "frames", "lte", "generated")
+"""Families on which an agent plays again, told when its stream ends."""
+_TOLD = "told the end"
+
+
+def told(makers: Mapping[str, families.Maker], folder: Path, agent: Policy) -> list[Row]:
+    """What an agent leaves on some families, as it was and told when each stream ends."""
+    rows = []
+    for name in filter(makers.__contains__, TOLD):
+        runs = families.bounded(name, makers[name], folder)
+        ends = [replace(run["episode"], ends_us=round(1e6 * run["scenario"].duration_s)) for run in runs]
+        family, known = (
+            Family(name, some)
+            for some in (runs, [{**run, "episode": episode} for run, episode in zip(runs, ends, strict=True)])
+        )
+        weights = times_drawn(family.links, RESAMPLES, stream(SEED, name))
+        shares = {"": family.shares(family.play(agent), weights), _TOLD: known.shares(known.play(agent), weights)}
+        rows.append(Row(name, len(runs), family.links, shares))
+    return rows
+
+
+def told_table(rows: Sequence[Row]) -> str:
+    """How much less is left where the end is told, paired."""
+    lines = [[row.name, _share(row, ""), _share(row, _TOLD), written(row.above(_TOLD, ""), "+.3f")] for row in rows]
+    return "\n".join(table(["", "not told", _TOLD, "difference"], lines))
 
 
 def mean_of(rows: Sequence[Row]) -> Row:

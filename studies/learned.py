@@ -48,7 +48,7 @@ the rule `gap-price`. It was made by `{made}`{seed}.
   the head; do what `gap-price` does. It is asked at every arrival, and takes the action with the highest output among
   the actions that are offered.
 - *Leaves to the rule* steady links whose rate has not changed by 10 % for {even:.0f} seconds, messages in bursts or of
-  unequal bytes, and a V that saturates.
+  unequal bytes, and a V that is not exponential.
 - *Is* a perceptron with hidden layers of {widths}, by {activation}.
 - *Falls short* of a rule, on a row below, by an interval without zero: {short}.
 - *Trained* on {families} families of links and streams at once. [Training](../docs/guide/training.md) says how.
@@ -78,6 +78,10 @@ It is better than the best rule by an interval without zero on {better} of {rows
 Parts of rows:
 
 {parts}
+
+**Told when a stream ends** (`tells_duration=True`), `{agent}` leaves on the same runs:
+
+{told}
 """
 PLANNER = """
 The hindsight planner (`studies/causal_planner.py`) on some of these runs. It knows the law of links and motion, and
@@ -122,6 +126,7 @@ def tables(
         shares=judging.shares_table(every, columns, agent),
         above=judging.above_table(every, agent, others),
         parts=judging.above_table(parts, agent, others) if parts else "none",
+        told=judging.told_table(judging.told(makers, folder, agents[agent])),
     )
     if planner:
         found = list(judging.planned(runs, folder, {**judging.rules(), **agents}))

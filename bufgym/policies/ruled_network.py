@@ -30,7 +30,7 @@ from bufgym.model.observe import (
     observe_candidates,
 )
 from bufgym.model.past import CHANGED_US
-from bufgym.model.qoi import SATURATING
+from bufgym.model.qoi import EXPONENTIAL
 from bufgym.policies import chains, price_dp, target_gap
 from bufgym.policies.candidate_network import CANDIDATES, HIDDEN, WIDTHS, CandidateWeights, Singles, forward, singles
 from bufgym.policies.past_inputs import N_PAST, NOTHING, PAST_INPUTS, PAST_NAMES, past_inputs
@@ -83,14 +83,14 @@ def even(buffer: Buffer) -> bool:
 
 @kernel
 def left_to_rule(buffer: Buffer, memory: Memory) -> bool:
-    """Whether the rule alone decides: what hindsight says there teaches nothing.
+    """Whether the rule alone decides: what hindsight says there teaches nothing, or the network was not taught it.
 
-    On an even link, in bursts, where V saturates and where sizes differ, accepting is
-    free in hindsight, as the clairvoyant could still drop the right messages later; who accepts does not.
+    On an even link, in bursts, where V saturates and where sizes differ, accepting is free in hindsight, as the
+    clairvoyant could still drop the right messages later; who accepts does not. A V by a table was never met.
     """
-    rule, is_saturating = memory[RULE:], buffer.v[0] == SATURATING
+    rule, is_other = memory[RULE:], buffer.v[0] != EXPONENTIAL
     is_unequal = price_dp.share(rule, BASE) > 0
-    return bool(is_saturating or is_unequal or bursty(rule) or even(buffer))
+    return bool(is_other or is_unequal or bursty(rule) or even(buffer))
 
 
 @kernel

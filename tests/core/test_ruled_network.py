@@ -52,7 +52,7 @@ def reference(made, margins):
         numbers = {f.name: f.function(buffer, arrival) for f in observe.ON_BOARD_FIELDS}
         past = [4 * (numbers[name] - nothing) for name, nothing in NOTHING.items()]
         is_even = buffer.past[CHANGED_US] == 0 or (numbers["since_change"] > 0.6 and thinning.steady(buffer))  # 3 s
-        is_left = buffer.v[0] == qoi.SATURATING or a > 0 or target_gap.bursty(rule)
+        is_left = buffer.v[0] != qoi.EXPONENTIAL or a > 0 or target_gap.bursty(rule)
         if is_even or is_left:
             does = [None for _ in does]
         same_as_rule = [float(decision == by_rule) for decision in does]
