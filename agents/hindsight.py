@@ -41,6 +41,7 @@ from agents.runs import MODEL, Record, Run, Validations, seed_bar
 from agents.settings import Hindsight
 from bufgym.policies import weights
 from bufgym.policies.candidate_network import CandidateWeights
+from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import replaced
 
 MEAN = 0.995
@@ -51,6 +52,8 @@ FIRST = 8_192
 """Decisions before the first gradient step."""
 EQUAL = 0.5
 """Share of a batch that families have in equal parts; the rest goes by what they still lose."""
+WAITED = 300
+"""Decisions of every row within which each family must have had a lesson."""
 LOST = 0.99
 """Weight of the past in a family's mean loss, at each gradient step."""
 TOLD = 1 / 3
@@ -175,7 +178,8 @@ class HindsightLearner(Learner[Hindsight]):
         curve = Record(home / "curve.csv", ("steps", "seconds", "loss"), school.steps)
         validations = Validations(home, objective.columns, objective.best, settings, school.steps)
         bar = seed_bar(settings.steps, school.steps, seed, line)
-        before, began, saved = school.seconds, time.perf_counter(), school.steps
+        before, began, first = school.seconds, time.perf_counter(), school.steps
+        saved = first
         if school.steps < settings.steps:
             rows.scatter(rng)
         while True:
@@ -202,6 +206,10 @@ class HindsightLearner(Learner[Hindsight]):
                     loss = school.learn(*lessons.draw(sizes, rng), sizes)
                 if school.steps % (CURVE * rows.n) == 0:
                     curve.append(school.steps, school.seconds, loss)
+            elif school.steps - first == rows.n * WAITED and not lessons.counts.all():
+                none = ", ".join(name for name, n in zip(rows.families, lessons.counts, strict=True) if not n)
+                where = none or "this task"
+                raise BufgymError(f"{where}: the rule gap-price alone decides there, so hindsight teaches nothing")
             school.seconds = round(before + time.perf_counter() - began, 3)
             bar.update(school.steps - bar.n)
         bar.close()

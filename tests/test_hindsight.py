@@ -105,17 +105,19 @@ def test_a_lesson_has_the_regrets_of_the_states_that_rows_reach() -> None:
     def choose(now: Any, offered: Any) -> Any:
         actions = np.where(offered[:, :-1], rng.random(offered[:, :-1].shape), -np.inf).argmax(axis=1)
         played.append(actions)
-        return actions
+        return np.where(offered[:, 0], actions, offered.shape[1] - 1)  # the first message is the rule's, which accepts
 
     for _ in range(30):
         asked = regrets.regrets()
         lesson = rows.step(choose)
         np.testing.assert_array_equal(lesson.seen[:, : inputs(2)], shown)
-        costs, of_rule = lesson.cost[:, :-1], lesson.cost[:, -1]
-        np.testing.assert_allclose(costs, np.where(np.isnan(asked), np.inf, asked), rtol=1e-6, atol=1e-7)
-        assert (np.isfinite(costs) == (info["action_mask"] != 0)).all() and (lesson.cost.min(axis=1) == 0).all()
-        same = lesson.seen[:, -4:] == 1
-        assert (costs[same] == of_rule[np.nonzero(same)[0]]).all() and same.any()
+        is_choice = np.isfinite(lesson.cost[:, 0])
+        costs, of_rule = lesson.cost[is_choice, :-1], lesson.cost[is_choice, -1]
+        np.testing.assert_allclose(costs, np.where(np.isnan(asked), np.inf, asked)[is_choice], rtol=1e-6, atol=1e-7)
+        assert (np.isfinite(costs) == (info["action_mask"][is_choice] != 0)).all()
+        assert (lesson.cost.min(axis=1) == 0).all()
+        same = lesson.seen[is_choice, -4:] == 1
+        assert (costs[same] == of_rule[np.nonzero(same)[0]]).all()
         played[-1][:2] = 0  # the rule plays 12 / 6 rows, or the next states would not be the same
         shown, *_, info = env.step(played[-1])
     assert len(set(np.concatenate(played).tolist())) > 2
@@ -198,7 +200,7 @@ TINY = Hindsight(
 )  # fmt: skip
 TASKS = {
     "environment": {},
-    "suite": {"environment": Environment(), "suites": Suites(("interruption-v1",), capacities=(3, 5))},
+    "suite": {"environment": Environment(), "suites": Suites(("generated-v1",), capacities=(3, 5))},
     "families": {"environment": Environment(), "sets": Families(("task", "lte"))},
 }
 
@@ -220,6 +222,17 @@ def test_training_keeps_an_agent_and_goes_on(task: str, tmp_path: Path, monkeypa
     second = HindsightLearner(longer).train_seed(tmp_path, 1)
     assert second.validation[: len(first.validation)] == first.validation
     assert second.validation[-1][0] > first.validation[-1][0]
+
+
+def test_where_the_rule_alone_decides_there_is_nothing_to_learn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("agents.hindsight.WAITED", 10)
+    monkeypatch.setattr("agents.hindsight_rows.LONGEST", 5)
+    chosen = Suites(("interruption-v1", "generated-v1"), capacities=(3,))
+    settings = dataclasses.replace(TINY, environment=Environment(), suites=chosen)
+    with pytest.raises(BufgymError, match="interruption-v1: the rule gap-price alone decides there"):
+        HindsightLearner(settings).train_seed(tmp_path, 1)
 
 
 def test_the_largest_network_of_families_fits_its_file(tmp_path: Path) -> None:

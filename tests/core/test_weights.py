@@ -77,11 +77,13 @@ def test_reading_a_policy_needs_no_torch(path):
     assert done.stdout.split() == ["False"]
 
 
-@pytest.mark.parametrize(("network", "rule"), [("scheduler", "gap-priority"), ("guided", "gap-price")])
-def test_a_file_of_numbers_that_moved_a_rule_names_what_does_so_now(path, network, rule):
+@pytest.mark.parametrize(
+    ("network", "command"), [("scheduler", "tune gap-priority"), ("guided", "tune gap-price"), ("ruled", "hindsight")]
+)
+def test_a_file_of_a_kind_that_is_gone_names_what_takes_its_place(path, network, command):
     weights.save(path, made(3), ABOUT)
     put(path, {f"{network}.weight": np.zeros((17, 9), np.float32)}, parts_of(path)[1])
-    refused(path, f"{rule} is that rule now, and python train.py tune {rule} finds its numbers")
+    refused(path, "made by bufgym until 0.2: ", f": python train.py {command}")
 
 
 def test_a_policy_for_one_queue_may_not_read_what_only_topics_have(path):
