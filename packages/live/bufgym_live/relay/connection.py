@@ -183,8 +183,7 @@ class Connection:
             self._release(size_bytes)
 
     async def _busy(self, topic: str, seq: int) -> None:
-        """Refuse a message for which the disk has no room yet, slowly, so that its client does not hurry."""
-        await asyncio.sleep(BUSY_S)
+        await asyncio.sleep(BUSY_S)  # so that its client does not hurry
         self._refused(RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
 
     async def _change(self, said: Mapping[str, Any]) -> None:
