@@ -26,10 +26,14 @@ Arrays = TypeVar("Arrays", bound=NamedTuple)
 
 def named(arrays: Arrays) -> Arrays:
     """The same memory, as records whose fields read as attributes in plain Python too."""
-    made: Arrays = cast(Any, type(arrays))(
-        *(array.view(np.recarray) if isinstance(array, np.ndarray) and array.dtype.names else array for array in arrays)
-    )
+    made: Arrays = cast(Any, type(arrays))(*map(_readable, cast(Any, arrays)))
     return made
+
+
+def _readable(value: Any) -> Any:
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return named(cast(Any, value))
+    return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
 
 
 def unchecked_item(array: NDArray[Any], k: int) -> Any:
