@@ -26,14 +26,17 @@ Arrays = TypeVar("Arrays", bound=NamedTuple)
 
 def named(arrays: Arrays) -> Arrays:
     """The same memory, as records whose fields read as attributes in plain Python too."""
-    made: Arrays = cast(Any, type(arrays))(*map(_readable, cast(Any, arrays)))
+    made: Arrays = cast(Any, type(arrays))(*map(readable, cast(Any, arrays)))
     return made
 
 
-def _readable(value: Any) -> Any:
+def readable(value: Any) -> Any:
+    """A value whose records are read by attributes in plain Python, also within a tuple of arrays."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return named(cast(Any, value))
-    return value.view(np.recarray) if isinstance(value, np.ndarray) and value.dtype.names else value
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        return value.view(np.recarray)
+    return value.view((np.record, value.dtype)) if type(value) is np.void else value
 
 
 def unchecked_item(array: NDArray[Any], k: int) -> Any:

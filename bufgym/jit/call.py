@@ -9,9 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
 
-import numpy as np
-
-from bufgym.jit.arrays import named
+from bufgym.jit.arrays import readable
 from bufgym.jit.way import JIT, WAY, C
 from bufgym.kernels.kinds import KernelError, Pointer
 
@@ -41,15 +39,6 @@ def _values_key() -> Callable[[Any], Any]:
     return key_of
 
 
-def _readable(value: Any) -> Any:
-    """A value whose records are read by attributes in plain Python."""
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return named(cast(Any, value))
-    if isinstance(value, np.ndarray) and value.dtype.names:
-        return value.view(np.recarray)
-    return value.view((np.record, value.dtype)) if type(value) is np.void else value
-
-
 class Call:
     """One call of a kernel, ready to be made again and again: of C, the same arrays and the same numbers."""
 
@@ -72,7 +61,7 @@ class Call:
         """Make the call; return the kernel's result."""
         if self._code is None:
             with in_python():
-                return self._function(*map(_readable, self._arguments))
+                return self._function(*map(readable, self._arguments))
         for copy, array in self._copies:
             copy[...] = array
         code = self._code
