@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(compiler.find() is None, reason=needs("compiler"
 def view_kind() -> Tuple:
     """The kind of a ``Buffer``."""
     constants = array_kind(float, constant=True)
-    own: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants}
+    own: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants, "past": array_kind(float)}
     own |= {"topics": array_kind(TOPIC)} | {n: FLOAT for n, kind in get_type_hints(Buffer).items() if kind is float}
     return Tuple(tuple(own.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")
 
