@@ -29,8 +29,8 @@ pytestmark = pytest.mark.skipif(compiler.find() is None, reason=needs("compiler"
 def view_kind() -> Tuple:
     """The kind of a ``Buffer``."""
     constants = array_kind(float, constant=True)
-    own: dict[str, Any] = {"slots": array_kind(MESSAGE), "v": constants, "parameters": constants, "past": array_kind(float)}
-    own |= {"topics": array_kind(TOPIC)} | {n: FLOAT for n, kind in get_type_hints(Buffer).items() if kind is float}
+    own: dict[str, Any] = {"slots": array_kind(MESSAGE), "topics": array_kind(TOPIC), "past": array_kind(float)}
+    own |= {"v": constants, "parameters": constants} | {n: FLOAT for n, kind in get_type_hints(Buffer).items() if kind is float}
     return Tuple(tuple(own.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")
 
 
