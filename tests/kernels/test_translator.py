@@ -30,7 +30,8 @@ def view_kind() -> Tuple:
     """The kind of a ``Buffer``."""
     constants = array_kind(float, constant=True)
     own: dict[str, Any] = {"slots": array_kind(MESSAGE), "topics": array_kind(TOPIC), "past": array_kind(float)}
-    own |= {"v": constants, "parameters": constants} | {n: FLOAT for n, kind in get_type_hints(Buffer).items() if kind is float}
+    own |= {"v": constants, "parameters": constants}
+    own |= {name: FLOAT for name, kind in get_type_hints(Buffer).items() if kind is float}
     return Tuple(tuple(own.get(name, INT) for name in Buffer._fields), Buffer._fields, "Buffer")
 
 
