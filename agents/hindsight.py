@@ -62,9 +62,12 @@ CURVE = 32
 """Steps of all rows from one row of the curve to the next."""
 
 
-def tells(cell: Cell) -> bool:
-    """Whether its robot may be told when its stream ends."""
-    return hasattr(cell.scenario, "tells_duration")
+def told(cell: Cell) -> list[Cell]:
+    """The same with a robot that is told when its stream ends; empty where none can be."""
+    scenario: Any = cell.scenario
+    return (
+        [cell._replace(scenario=replace(scenario, tells_duration=True))] if hasattr(scenario, "tells_duration") else []
+    )
 
 
 class School:
@@ -154,8 +157,8 @@ class HindsightLearner(Learner[Hindsight]):
         found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.suite}
         parts = []
         for family, own in found.items():
-            told = [cell._replace(scenario=replace(cell.scenario, tells_duration=True)) for cell in own if tells(cell)]
-            for some, share in ((own, 1 - TOLD * bool(told)), (told, TOLD)):
+            knowing = [each for cell in own for each in told(cell)]
+            for some, share in ((own, 1 - TOLD * bool(knowing)), (knowing, TOLD)):
                 parts += [Part(family, cell, math.ceil(share * n / len(found) / len(some))) for cell in some]
         return parts
 
