@@ -188,7 +188,7 @@ def test_a_bag_becomes_a_csv_that_plays_the_same(drive: Path, capsys: Capsys) ->
 
 def test_a_recording_is_described_before_the_long_work(drive: Path, capsys: Capsys, monkeypatch: Patch) -> None:
     """Stopped at once: what was read, what was left out, and how much work there is have been said."""
-    monkeypatch.setattr("bufgym.benchmark.compare.run", stopped)
+    monkeypatch.setattr("bufgym.benchmark.parts.run", stopped)
     assert main(["bench", "--trace", "outage.csv", "--workload", str(drive), "--topics", "/status", "/camera/*"]) == 130
     out, err = capsys.readouterr()
     assert "; 3 messages left out" in out and "6 messages, 1,556 bytes in 2.000 s" in out

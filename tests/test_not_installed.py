@@ -152,5 +152,5 @@ for words in (["export", "own.py", "own.safetensors", "--name", "own"], ["relay"
     assert done.returncode == 0, done.stderr
     assert {"bench", "trace from-bag", "relay serve", "live send", "reproduce"} <= set(done.stdout.splitlines())
     export, relay = done.stderr.splitlines()
-    assert "bufgym.sb3 needs stable_baselines3: pip install" in export and "[train]" in export
+    assert "bufgym.sb3 needs torch: pip install" in export and "[train]" in export
     assert "bufgym relay needs msgspec: pip install" in relay and "[relay]" in relay

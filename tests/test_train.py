@@ -16,6 +16,7 @@ from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
 from agents.constants import NAMES
 from agents.held_out import FixedEpisodes
+from agents.hindsight_network import Student
 from agents.learner import learner_of
 from agents.report import verdict
 from agents.settings import DQN, PPO, Environment, Hindsight, SingleDecisions, Suites
@@ -73,14 +74,15 @@ def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
 
 
 def test_two_ways_are_compared_and_the_best_is_kept(capsys: Capsys) -> None:
-    """The network that the clairvoyant teaches begins as the rule that drops the cheapest."""
+    """The first validation is of the network before it is taught."""
     on = Environment(capacity=8, duration_s=3.0, episodes=3)
     taught = Hindsight(environment=on, **{**SHARED, "steps": 3_000, "validate_every": 3_000})
     train.main(taught, train.others_of(taught))
     folder = Path("runs/tiny")
     (_, first), *_ = columns(folder / "hindsight" / "seed-0" / "validation.csv", "steps", "qoi")
     judges, test = FixedEpisodes(on, "validation", 2), FixedEpisodes(on, "test", 3)
-    assert first == np.mean([outcome.qoi for outcome in judges.play(policies.get("min-motion-gap"))])
+    untaught = Student(taught.resolved.candidates, taught.width).weights().policy("untaught")
+    assert first == np.mean([outcome.qoi for outcome in judges.play(untaught)])
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     scores = {row["policy"]: row["qoi"] for row in results["scores"]}
     best = results["settings"]["algo"]
