@@ -1,14 +1,14 @@
 """Forms of an observation; each is a view of the flat row of numbers that kernels write."""
 
-import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from bufgym.envs.output import BufferPool
 from bufgym.model.observe import BUILT_IN, OWN_FIELDS, Field, chosen_at, own_field
 from bufgym.utils.errors import BufgymError, unknown
 
@@ -190,37 +190,6 @@ def _space(low: Observation, high: Observation) -> Any:
         return spaces.Box(low, high)
     # Gymnasium sorts the keys of any mapping but an OrderedDict, and so would flatten in another order.
     return spaces.Dict(OrderedDict((name, spaces.Box(low[name], high[name])) for name in low))
-
-
-Buffers = TypeVar("Buffers")
-
-
-class BufferPool(Generic[Buffers]):
-    """Arrays for results, used again once the caller has let go of them, so that a step allocates nothing.
-
-    Python counts the references to an array. As long as there are more to one of the arrays, or to a view of it, than
-    when it was made, the caller holds it, and it is not written again. Without the pool a step of 64 environments takes
-    50 us in place of 36 with candidates, and 88 in place of 42 with slots. One environment with slots takes 14 us in
-    place of 5.4; with candidates its 27 numbers are copied, which takes no pool.
-    """
-
-    def __init__(self, make: Callable[[], tuple[Buffers, Sequence[NDArray[Any]]]]) -> None:
-        """``make`` returns new buffers, and their arrays with all views of them that are returned."""
-        self._make = make
-        self._pool: list[tuple[Buffers, Sequence[NDArray[Any]], list[int]]] = []
-
-    def take(self) -> Buffers:
-        """Buffers that nobody holds, with any content."""
-        for buffers, arrays, references_when_free in self._pool:
-            if list(map(sys.getrefcount, arrays)) == references_when_free:
-                return buffers
-        buffers, arrays = self._make()
-        # The oldest leave the pool, as a caller that collects results holds them all.
-        self._pool = [*self._pool[1 - _POOLED :], (buffers, arrays, list(map(sys.getrefcount, arrays)))]
-        return buffers
-
-
-_POOLED = 4  # Most buffers in a pool
 
 
 class Handed:

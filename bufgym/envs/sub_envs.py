@@ -13,11 +13,10 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.candidates import new_choices
 from bufgym.envs.cost import Charges
 from bufgym.envs.observation import Handed, Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
-from bufgym.envs.output import StepOutput
+from bufgym.envs.output import StepOutput, new_choices
 from bufgym.envs.own import OwnFields, OwnTerms
 from bufgym.envs.regret import Regret
 from bufgym.envs.reward import APART, reward_weights

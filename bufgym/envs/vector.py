@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.observation import BufferPool, Observation
+from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
+from bufgym.envs.output import BufferPool
 from bufgym.envs.sub_envs import SubEnvs, check_entries
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
