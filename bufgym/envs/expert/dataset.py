@@ -107,7 +107,7 @@ def record(
             numbers[i, T] = 0.0, sub_envs.output.qoi[i], 0.0
             yield Recorded(
                 roles[turns[i]],
-                sub_envs.form.masked(sub_envs.form.of(seen[i, : T + 1].copy()), masks[i, : T + 1].copy()),
+                sub_envs.form.of(seen[i, : T + 1].copy()),
                 taken[i, :T].copy(),
                 numbers[i, :T, 0].copy(),
                 masks[i, : T + 1].copy(),
