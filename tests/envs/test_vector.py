@@ -289,7 +289,7 @@ test_wrong_use_is_named = refused(
         (lambda n=n: SenderVectorEnv(max_episode_steps=n, actions="slots"), "max_episode_steps = ")
         for n in (0, 1.5, "5")
     ),
-    (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', 'slots'"),
+    (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', None"),
     (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'summary', 'mask'"),
     (lambda: SenderVectorEnv(info="summary", actions="slots"), "info = 'summary': is for recorders"),
     (lambda: SenderVectorEnv(num_threads=0, actions="slots"), "num_threads = 0: must be"),

@@ -157,7 +157,7 @@ def make(
     name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"
     root = _folder_for(name, out)
     single = _environment_of(env, options)
-    batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
+    batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "mask"})
     recorded = record(batch, kind, episodes, medium=medium, seed=seed, regret=regret)
     players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
     about = f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}"
