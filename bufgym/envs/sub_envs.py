@@ -22,12 +22,14 @@ from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
 from bufgym.jit import Repeated
 from bufgym.model.observe import (
+    BUILT_IN,
     CANDIDATE_FIELDS,
     CONTEXT_FIELDS,
     QUEUE_FIELDS,
     SLOT_FIELDS,
     TOPIC_CONTEXT_FIELDS,
     TOPIC_SLOT_FIELDS,
+    own_field,
     terms_for,
 )
 from bufgym.oracle.measure import MEASURED, measured
@@ -121,8 +123,10 @@ class SubEnvs:
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
         chosen = options.fields
+        slots, context = ({field.name for field in fields} for fields in (slot_fields, context_fields))
+        beside = context | ({*BUILT_IN} - slots)
         only_chosen = chosen is not None and not several_topics and not self.keeps_slots
-        if several_topics and not self.keeps_slots and chosen and not {f.name for f in slot_fields} & {*chosen}:
+        if several_topics and not self.keeps_slots and chosen and all(n in beside or own_field(n) for n in chosen):
             slot_fields = ()
         return ObservationForm(
             options.form, slot_fields, context_fields, self.capacity, chosen, only_chosen=only_chosen
