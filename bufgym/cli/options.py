@@ -92,8 +92,8 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1), or module:NAME, your own
-    bufgym.suite(...), whose code is run; --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'), or module:NAME, your own bufgym.suite(...), whose code is run; --out DIR keeps it,
+    a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -101,9 +101,8 @@ class SuiteOptions:
     jobs: Whole | None = None
     """Processes side by side, -1 for one a core (default: a suite one a core, any other one)."""
     backend: str | None = None
-    """loky (default), threading, sequential, ray or dask."""
-    address: str | None = None
-    """Head of the Ray or Dask cluster (default: one on this machine)."""
+    """loky (default), threading, sequential, ray or dask (on the cluster of RAY_ADDRESS or DASK_SCHEDULER_ADDRESS, else
+    on this machine)."""
 
 
 @Parameter(name="*", group=Group.create_ordered("Who runs"))
@@ -139,8 +138,6 @@ RESULTS = Group.create_ordered("Where results go", sort_key=1)
 class OutOptions:
     out: str | None = None
     """Write rows and what was run into this folder, or rows alone into this .csv or .parquet file."""
-    format: Literal["csv", "parquet"] | None = None
-    """Format of the rows (default: parquet if it can)."""
     report: str | None = None
     """Write the page to this HTML file: ranking with intervals, charts, one episode (extra 'report')."""
     by_topic: str | None = None
@@ -150,8 +147,6 @@ class OutOptions:
         """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
         from bufgym.benchmark.rows import checked_target
 
-        if self.format == "parquet" and self.out is not None:
-            library("pyarrow", "bench", "--format parquet, unlike csv,")
         if self.out is None or not Path(self.out).suffix[1:].isalpha() or Path(self.out).is_dir():
             return None
         file = checked_target(self.out)
