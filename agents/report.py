@@ -119,7 +119,10 @@ NEXT = (
     "  bufgym export {model} mine.safetensors --name mine",
 )
 """What to do with a model."""
-NEXT_OF_FLEET = ("  bufgym fleet --policies {model},learned,afr   # compare it in other cells", NEXT[-1])
+NEXT_OF_FLEET = (
+    "  bufgym bench --suite fleet-v1 --policies {model},learned,afr   # compare it in other cells",
+    NEXT[-1],
+)
 
 Report = tuple[list[int], dict[str, Any], str]
 """The seeds and scores for the notes of the kept agent, and what the folder holds."""

@@ -97,7 +97,8 @@ def bench(
         _announce(experiment, len(capacity))
 
     try:
-        done = compare(entrants, experiment.on, capacity=capacity, against=rival, out=folder, **experiment.arguments)
+        kept: dict[str, Any] = {"out": folder, "form": out.format}
+        done = compare(entrants, experiment.on, capacity=capacity, against=rival, **kept, **experiment.arguments)
     except KeyboardInterrupt:
         resumable = suite.suite is not None and folder is not None
         raise KeyboardInterrupt(*["the same command resumes it"] * resumable) from None
@@ -230,4 +231,3 @@ def _write_playback(
     print(f"\nwrote {file}, L = {capacity}:")
     for name, (delivered, dropped) in counts.items():
         print(f"  /{name}/delivered/...: {delivered:,}, /{name}/dropped/...: {dropped:,}, /{name}/queue")
-

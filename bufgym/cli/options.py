@@ -138,6 +138,8 @@ RESULTS = Group.create_ordered("Where results go", sort_key=1)
 class OutOptions:
     out: str | None = None
     """Write rows and what was run into this folder, or rows alone into this .csv or .parquet file."""
+    format: Literal["csv", "parquet"] | None = None
+    """Format of the rows (default: parquet if it can)."""
     report: str | None = None
     """Write the page to this HTML file: ranking with intervals, charts, one episode (extra 'report')."""
     by_topic: str | None = None
@@ -147,6 +149,8 @@ class OutOptions:
         """The file of ``--out``; None for a folder or nothing. Another kind of file is an error."""
         from bufgym.benchmark.rows import checked_target
 
+        if self.format == "parquet" and self.out is not None:
+            library("pyarrow", "bench", "--format parquet, unlike csv,")
         if self.out is None or not Path(self.out).suffix[1:].isalpha() or Path(self.out).is_dir():
             return None
         file = checked_target(self.out)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cyclopts import Group, Parameter
 
 from bufgym.cli.options import Bytes, Holes, Positive, given, refuse
-from bufgym.cli.trace_bags import RecordingOptions, workload_lines
+from bufgym.cli.trace_bags import MotionOptions, RecordingOptions, workload_lines
 from bufgym.utils import modules
 from bufgym.utils.errors import BufgymError, printable
 from bufgym.utils.progress import bar
@@ -71,18 +71,18 @@ class WorkloadOptions(RecordingOptions):
     time_unit: str | None = None
     """Of its times: s, ms, us, ns (default: that in the column's name, else s)."""
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self, measured: MotionOptions | None = None) -> dict[str, Any]:
         """Collect those given for ``read_workload``."""
         if self.columns is None:
             refuse(given(self, "time_unit"), "needs --columns")
-            return super().arguments()
+            return super().arguments(measured)
         from bufgym.traces import Columns
 
         if len(self.columns) not in (2, 3):
             raise BufgymError(f"--columns {' '.join(self.columns)}: must be TIME BYTES or TIME BYTES TOPIC")
         time, size, topic = [*self.columns, ""][:3]
         chosen = Columns(time, bytes=size, topic=topic, time_unit=self.time_unit or "")
-        return {**super().arguments(), "columns": chosen}
+        return {**super().arguments(measured), "columns": chosen}
 
 
 class Described(NamedTuple):
@@ -179,6 +179,10 @@ def recorded(files: Sequence[str], stream: StreamOptions, recording: RecordingOp
     from bufgym.traces import read_workload
 
     refuse(given(stream, *_MESSAGES, "scenario_file"), "cannot go with --workload: a recording has its own")
+    name = stream.scenario or DEFAULT
+    base = scenarios.get(name)
+    if "workload" not in scenarios.registry.parameters(base):
+        raise BufgymError(f"--workload cannot go with {printable(name)}, which plays no recording")
     with bar(None, True, "message") as advance:
         workload = read_workload(files, **recording.arguments(), advance=advance)
     motion = "none" if stream.motion in (None, ["none"]) else stream.motion
@@ -189,4 +193,4 @@ def recorded(files: Sequence[str], stream: StreamOptions, recording: RecordingOp
         **{"motion": motion, "random_offset": seeds is not None, "workload": workload},
     }
     lines = [printable(workload.source), "", *workload_lines(workload), ""]
-    return Described(scenarios.get(stream.scenario or DEFAULT, **settings), lines, recorded=True)
+    return Described(scenarios.get(base, **settings), lines, recorded=True)
