@@ -40,9 +40,10 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
         ("bench --capacity 4 4", "--capacity 4,4: must be whole numbers >= 1, no two alike"),
         ("bench --bytes 1.5", "1.5: must be a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB"),
         ("bench --bytes 4.6Mbit", "4.6Mbit: must be a whole number of bytes >= 1"),
-        ("trace generate steady --rate 20Mbit --out x.csv", "20Mbit: must be bytes/s > 0, or as in 20Mbit/s"),
+        ("trace generate ramp --start 20Mbit --out x.csv", "20Mbit: must be bytes/s > 0, or as in 20Mbit/s"),
         (" ".join([*QUICK, "--bytes 4.6MB --max-bytes 1150000"]), "no message fits, the smallest has 4600000 bytes"),
         ("benc", 'Did you mean "bench"?'),
+        ("trace convert lte-synthetic-0 --out x.csv --time t", "--time and --rate go together"),
         ("trace inf", 'Did you mean "info"?'),
         ("trace info missing.csv", "missing.csv"),
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
@@ -113,7 +114,9 @@ def test_natural_inputs(tmp_path: Path, capsys: Capsys) -> None:
     shown([*QUICK, "--capacity", "2", "4", "--bytes", "4.6MB", "--format", "csv", "--out", out], capsys)
     assert [row["capacity"] for row in read_rows(out / "rows.csv")] == [2, 4]
     fails([*QUICK, "--out", out], "rows.csv: holds an earlier run's rows; choose another --out", capsys)
-    shown(["trace", "generate", "steady", "--rate", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys)
+    shown(
+        ["trace", "generate", "ramp", "--start", "20Mbit/s", "--end", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys
+    )
     assert "2,500" in shown(["trace", "info", tmp_path / "s.csv"], capsys)
 
 
