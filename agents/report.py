@@ -257,7 +257,7 @@ def table(
 
 def report_suites(trained: Trained) -> Report:
     """Score all agents on each suite, in a folder for each if there are several."""
-    names, contents = trained.settings.suites.suite, "model, rows, figure and numbers"
+    names, contents = trained.settings.suites.names, "model, rows, figure and numbers"
     if len(names) == 1:
         return [trained.best.seed], report_suite(trained, names[0], trained.folder)[0], contents
     notes: dict[str, Any] = {}
