@@ -25,7 +25,8 @@ Share = Annotated[float, checked(float, lambda number: 0 <= number <= 1, "a numb
 
 def options_of(settings: Any) -> dict[str, Any]:
     """Option -> value, also of the settings within these."""
-    kinds, found = get_type_hints(type(settings), include_extras=True), {}
+    found: dict[str, Any] = {}
+    kinds = get_type_hints(type(settings), include_extras=True)
     for name, value in vars(settings).items():
         if is_dataclass(value):
             found |= options_of(value)
