@@ -35,8 +35,8 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     ``QUEUE_FIELDS`` of ``bufgym.model.observe``). Most are logarithms of ratios in [-3, 3], so they mean the same at
     every L, frame rate and size. ``observation="dict"`` gives an array for each field.
 
-    **Reward** ``paired`` by default: what drops cost, less what they cost the rule ``reference``, which always drops the
-    cheapest candidate, on the same episode. It adds up to H less that rule's H. Other terms, or weights of several, go
+    **Reward** ``paired`` by default: what drops cost, less what they cost the rule ``reference``, which always drops
+    the cheapest, on the same episode. It adds up to H less that rule's H. Other terms, or weights of several, go
     by name: ``bufgym.model.observe.REWARD_TERMS`` and ``OWN_TERMS`` say what each pays. ``info["reward_terms"]`` has
     each.
 

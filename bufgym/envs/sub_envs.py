@@ -97,7 +97,9 @@ class SubEnvs:
             self.actions_count = options.candidates + 1 + (options.asked_at == "arrival")
         self.action_space: Any = spaces.Discrete(self.actions_count)
 
-        self.weights, own_terms = reward_weights(options.reward_of(self.own_links and not several_topics), several_topics)
+        self.weights, own_terms = reward_weights(
+            options.reward_of(self.own_links and not several_topics), several_topics
+        )
         self.terms = terms_for(several_topics) + own_terms
         self._term_names = names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(names)))
