@@ -128,7 +128,7 @@ class Reproduction(Figure):
 @contextlib.asynccontextmanager
 async def _receiver() -> AsyncIterator[tuple[int, list[Any]]]:
     """The other end of our sender; gives its port and the list of received messages."""
-    from bufgym_live.robot.receiver import Receiver
+    from bufgym_robot.receiver import Receiver
 
     came: list[Any] = []
     receiver = Receiver(lambda message: came.append(message.seq))

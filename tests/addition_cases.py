@@ -226,7 +226,7 @@ ROWS = {
             f"{LIVE}/robot/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
             f"{LIVE}/robot/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
         },
-        "from bufgym_live.robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
+        "from bufgym_robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
         "async def all_come():\n"
         "    came = []\n"
         "    receiver = Receiver(came.append)\n"
