@@ -22,7 +22,8 @@ from bufgym.model import Link
 from bufgym.policies import Policy, get
 from bufgym.scenario import read_client
 from bufgym.traces import Trace
-from bufgym_relay import Config, Foxglove, Robot, Rule, Server, compiled
+from bufgym_relay import Config, Foxglove, Rule, Server, compiled
+from bufgym_robot import Robot
 from bufgym_robot import ShapedLink
 
 CLEAR_BPS: Final = 1_000_000

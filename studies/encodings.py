@@ -151,7 +151,7 @@ def _typed(store: Any, type_name: str, value: Content) -> Any:
 
 
 def _flatbuffer(type_name: str, message: Content, topic: str | None) -> bytes:
-    builder = library("flatbuffers", "bufgym-live[robofleet]").Builder(1024)
+    builder = library("flatbuffers", "bufgym-robot[robofleet]").Builder(1024)
     metadata = 0
     if topic is not None:
         texts = [builder.CreateString(text) for text in (type_name.replace("/msg/", "/"), topic)]

@@ -35,8 +35,8 @@ from loop_cases import beside as beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import client
 
-from bufgym_relay import wire
-from bufgym_relay.wire import Message
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.messages import Message
 
 SIZE_BYTES, RATE_HZ, MEMORY_S = 50_000, 10, 30.0
 _BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80

@@ -50,7 +50,7 @@ class Reproduction(Figure):
         if not sys.platform.startswith("linux"):
             raise BufgymError("robofleet-table2: virtual memory is read from /proc, which this system does not have")
         for name in ("roslibpy", "rosbags", "flatbuffers", "websockets"):
-            library(name, "bufgym-live[rosbridge]", "robofleet-table2")
+            library(name, "bufgym-robot[rosbridge]", "robofleet-table2")
         return asyncio.run(self._measure())
 
     async def _measure(self) -> FigureRows:

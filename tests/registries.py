@@ -42,7 +42,7 @@ REGISTRIES = (
     "bufgym_robot.buses:BUSES",
     "bufgym_robot.channels:TRANSPORTS",
     "bufgym_relay.plain:PLAIN",
-    "bufgym_relay.ros:SOURCES",
+    "bufgym_robot.fleet.ros:SOURCES",
     "bufgym_papers.figures:FIGURES",
     "agents.objectives:OBJECTIVES",
 )

@@ -18,12 +18,13 @@ from websockets.frames import DATA_OPCODES, Frame
 from websockets.http11 import Request
 from websockets.protocol import Event, State
 
-from bufgym_relay import turns, wire
+from bufgym_relay import turns
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Limits
 from bufgym_relay.hub import Hub
 from bufgym_relay.rules import Identity, Permissions, plain_address
-from bufgym_relay.wire import RefusedError
-from bufgym_robot.sockets import BACKOFF_S, DEAD_AFTER_S, bounded_backoff, little_unsent, set_option
+from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.sockets import BACKOFF_S, DEAD_AFTER_S, bounded_backoff, little_unsent, set_option
 
 POLICY_VIOLATION: Final = 1008
 _OTHER_METHODS: Final = frozenset(b"HEAD POST PUT DELETE CONNECT OPTIONS TRACE PATCH".split())

@@ -17,7 +17,7 @@ from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import read_utf8
 from bufgym.utils.libraries import needs
 from bufgym_relay.config import Nats, StoreLimits
-from bufgym_relay.wire import RefusedError
+from bufgym_robot.wire.messages import RefusedError
 
 MESSAGE: Final = "bufgym.relay.message"
 HOLD: Final = "bufgym.relay.hold"
@@ -47,7 +47,7 @@ def options(settings: Nats) -> dict[str, Any]:
     names = ("user", "password") if url.password is not None else ("token",)
     found |= {name: unquote(value) for name, value in zip(names, (url.username, url.password), strict=False) if value}
     if file:
-        with needs("nkeys", "bufgym-live[mesh]", "bufgym_relay"):
+        with needs("nkeys", "bufgym-relay[mesh]", "bufgym_relay"):
             import_module("nkeys")
         text = read_utf8(file, 2**16)
         if not all(f"{line}\n" in text for line in _CREDENTIALS):  # the library would look for them for ever
@@ -66,7 +66,7 @@ class Bus:
 
     def __init__(self, settings: Nats, limits: StoreLimits, note: Callable[[str], None], most: int) -> None:
         """``note`` is told of faults that leave the connection as it is; ``most`` as the last connection left it."""
-        with needs("nats", "bufgym-live[mesh]", "bufgym_relay"):
+        with needs("nats", "bufgym-relay[mesh]", "bufgym_relay"):
             import nats.aio.client
         self._library: Any = nats
         self._client: Any = nats.aio.client.Client()

@@ -5,25 +5,17 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
 from bufgym_relay.rules import Identity, Permissions
 from bufgym_relay.store import Store
 from bufgym_relay.stored import StoredSession
-from bufgym_relay.wire import RefusedError
+from bufgym_robot.wire.messages import RefusedError
 
 SILENT_S: Final = 3.0
 """Silence of a robot after which another connection may be it; a robot says something five times a second."""
 _MOST: Final = 10_000
 CLAIM: Final = "claim"
-
-
-def check_name(name: str) -> None:
-    """Raise WireError if a robot's topics cannot have this name."""
-    wire.check_name("robot", name)
-    longest = wire.MAX_NAME_BYTES - len("/robots//command")
-    if not name or "/" in name or len(name.encode()) > longest:
-        raise wire.WireError(f"robot {name!r}: must be a printable text without '/' of at most {longest} bytes")
 
 
 class Claims:
@@ -52,7 +44,7 @@ class Claims:
 
         Raises RefusedError: no rule lets it, or another connection is this robot and not silent.
         """
-        check_name(robot)
+        wire.check_robot(robot)
         if not permissions.allow("send", f"/robots/{robot}/status"):
             raise RefusedError("unauthorized", f"robot {robot}: no rule allows to send /robots/{robot}/status")
         other = self._sessions.get(robot)

@@ -15,8 +15,8 @@ from msgspec.structs import replace
 from bufgym.model.checks import MAX_WINDOW
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import read_toml
-from bufgym_relay.orders import COMMAND_S
-from bufgym_relay.patterns import pattern
+from bufgym_robot.wire.orders import COMMAND_S
+from bufgym_robot.wire.patterns import pattern
 
 PORT: Final = 7420
 NO_DROP: Final = ("/robots/[^/]+/command",)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from bufgym_relay.ledger import Stop, read
+from bufgym_robot.wire.ledger import Stop, read
 
 
 class Writer(Protocol):

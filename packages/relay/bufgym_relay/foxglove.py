@@ -12,13 +12,13 @@ from typing import Any, Final
 from bufgym.traces.formats.bag_poses import Frames
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.libraries import needs
-from bufgym_relay import ros_messages, wire
+from bufgym_robot.wire import ros_messages, messages as wire
 from bufgym_relay.config import Config, Foxglove, Rule
 from bufgym_relay.gate import Gate, hidden_host
-from bufgym_relay.place import Place
+from bufgym_robot.wire.place import Place
 from bufgym_relay.recorder import SCHEMAS
 from bufgym_relay.rules import FOXGLOVE, Permissions
-from bufgym_relay.session import Session
+from bufgym_robot.wire.session import Session
 
 OWN_PAGES: Final = ("https://app.foxglove.dev", "file://")  # The web page, and programs that are pages of their own
 MAX_CHANNELS: Final = 10_000  # Limit on channels, which clients open by topic and type; further channels are not shown
@@ -32,7 +32,7 @@ class Screen:
 
     def __init__(self, host: str, port: int, origins: Sequence[str] = ()) -> None:
         """Web pages of ``origins`` may connect, besides Foxglove's own and programs that are no page."""
-        with needs("foxglove", "bufgym-live[foxglove]", "bufgym_relay"):
+        with needs("foxglove", "bufgym-relay[foxglove]", "bufgym_relay"):
             import foxglove
         self._foxglove = foxglove
         self._context = foxglove.Context()

@@ -13,7 +13,7 @@ from collections.abc import Collection
 from contextlib import closing, suppress
 from typing import Final
 
-from bufgym_robot.tasks import Tasks, until_one_ends
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 _HEAD_S: Final = 10.0  # time for a request's head
 _MOST: Final = 128  # connections at a time

@@ -10,20 +10,21 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
 from bufgym_relay.claims import Claims
-from bufgym_relay.clock import ServerClock
+from bufgym_robot.wire.clock import ServerClock
 from bufgym_relay.config import Config
 from bufgym_relay.desk import Desk
 from bufgym_relay.disk import Disk
-from bufgym_relay.drive import Drivers
+from bufgym_relay.drivers import Drivers
 from bufgym_relay.held import MOST
 from bufgym_relay.last import Last
 from bufgym_relay.member import Member, OtherRelays
-from bufgym_relay.orders import Orders, heard_stops, robot_of
+from bufgym_relay.orders import Orders
+from bufgym_robot.wire.orders import heard_stops, robot_of
 from bufgym_relay.outgoing import Outgoing
-from bufgym_relay.patterns import escaped, pattern
+from bufgym_robot.wire.patterns import escaped, pattern
 from bufgym_relay.quota import Quotas
 from bufgym_relay.recorder import Recorder, Tape
 from bufgym_relay.roster import GONE, Roster, is_last, status_of
@@ -32,8 +33,8 @@ from bufgym_relay.store import Store
 from bufgym_relay.stored import Settled, StoredSession
 from bufgym_relay.subscriber import Subscription
 from bufgym_relay.turns import Turns
-from bufgym_relay.wire import RefusedError
-from bufgym_robot.tasks import Tasks
+from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.tasks import Tasks
 
 if TYPE_CHECKING:
     from bufgym_relay.foxglove import Window

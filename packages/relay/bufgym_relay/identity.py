@@ -13,7 +13,7 @@ from typing import Any, Final
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import read_utf8
 from bufgym_relay.config import Tls, Tokens
-from bufgym_relay.wire import RefusedError
+from bufgym_robot.wire.messages import RefusedError
 
 MAX_KEYS_BYTES: Final = 2**20
 MAX_TOKEN_CHARACTERS: Final = 2**14

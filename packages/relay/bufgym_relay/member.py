@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Rule
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.rules import Permissions

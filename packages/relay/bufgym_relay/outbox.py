@@ -11,13 +11,13 @@ from typing import Final
 
 from websockets.exceptions import WebSocketException
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.caller import Caller
 from bufgym_relay.member import Member
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.stored import NOT_REACHED
 from bufgym_relay.subscriber import Lane, Subscription, make_one, next_lane
-from bufgym_relay.wire import WireError
+from bufgym_robot.wire.messages import WireError
 
 LARGE_BYTES: Final = 2**16  # Size of a message beyond which its writing takes long
 MAX_ANSWERS: Final = 4_096  # Limit on unsent answers; a client that asks on without reading is closed

@@ -5,7 +5,7 @@ from typing import Final
 
 from websockets.frames import Frame, Opcode
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 
 ROBOFLEET: Final = "robofleet"
 """Encoding of Robofleet's flatbuffers, and the only form in which its clients get messages."""

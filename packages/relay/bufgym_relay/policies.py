@@ -13,7 +13,7 @@ from bufgym_relay.plain import PLAIN, Latest
 
 if TYPE_CHECKING:
     from bufgym.policies.registry import Policy
-    from bufgym_robot import PolicyQueue
+    from bufgym_robot.wire.queue import PolicyQueue
 
 Rule: TypeAlias = "Policy | type[Latest]"
 PLACES: Final = 32  # Topics that share a queue, where the policy knows topics
@@ -35,7 +35,7 @@ def new_queue(chosen: Rule, capacity: int) -> PolicyQueue | Latest:
     if isinstance(chosen, type):
         return chosen(capacity)
     from bufgym.model.topics import Topic
-    from bufgym_robot import PolicyQueue
+    from bufgym_robot.wire.queue import PolicyQueue
 
     topics = tuple(Topic(f"/{k}") for k in range(PLACES)) if chosen.for_topics else ()
     return PolicyQueue(chosen, capacity, topics=topics, room=ROOM)

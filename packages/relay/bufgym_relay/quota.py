@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from bufgym_relay.config import Limits
-from bufgym_relay.wire import RefusedError
+from bufgym_robot.wire.messages import RefusedError
 
 
 class Bucket:

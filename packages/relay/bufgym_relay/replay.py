@@ -21,7 +21,7 @@ from mcap.stream_reader import StreamReader
 
 from bufgym.utils import strict_json
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 
 MOST_BYTES: Final = 4 * 2**20  # Limit on the payloads of a piece
 _MAGIC: Final = b"\x89MCAP0\r\n"

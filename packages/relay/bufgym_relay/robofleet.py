@@ -13,7 +13,8 @@ import struct
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from bufgym_relay import protocol, wire
+from bufgym_relay import protocol
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import SKIP_PENDING
 from bufgym_relay.connection import Connection
@@ -21,7 +22,7 @@ from bufgym_relay.outgoing import ROBOFLEET, Outgoing
 from bufgym_relay.protocol import Admitted
 from bufgym_relay.rules import Permissions
 from bufgym_relay.subscriber import Subscription
-from bufgym_relay.wire import WireError
+from bufgym_robot.wire.messages import WireError
 
 SUBSCRIPTION_TYPES: Final = ("amrl_msgs/RobofleetSubscription", "RobofleetSubscription")
 _FIRST: Final = 4  # offset of a table's field 0 in its vtable; each further field is 2 bytes on

@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from bufgym_relay import wire
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.store import Store
 
 AWAY_S: Final = 5.0

@@ -23,7 +23,8 @@ from websockets.typing import Subprotocol
 
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.libraries import needs
-from bufgym_relay import connection, pages, policies, turns, wire
+from bufgym_relay import connection, pages, policies, turns
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.admission import Accepted, Admission
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import POLICIES, Config
@@ -32,8 +33,8 @@ from bufgym_relay.hub import CONNECTED, STATUS, Hub
 from bufgym_relay.identity import Verifier, renew, server_context
 from bufgym_relay.robofleet import RobofleetConnection
 from bufgym_relay.rules import Identity, Permissions
-from bufgym_robot.sockets import free_port
-from bufgym_robot.tasks import until_one_ends
+from bufgym_robot.wire.sockets import free_port
+from bufgym_robot.wire.tasks import until_one_ends
 
 if TYPE_CHECKING:
     from bufgym_relay.foxglove import Window

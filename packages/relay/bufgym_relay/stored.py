@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from bufgym_relay.patterns import Pattern
+from bufgym_robot.wire.patterns import Pattern
+from bufgym_robot.wire.unanswered import UNKNOWN
 from bufgym_relay.rules import Identity
-from bufgym_relay.wire import RefusedError
+from bufgym_robot.wire.messages import RefusedError
 
 NOT_REACHED: Final = "not reached: its robot was away until the deadline"
-UNKNOWN: Final = "nobody knows whether it was executed"
 
 
 @dataclass(eq=False)

@@ -17,12 +17,12 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from bufgym_relay.patterns import Pattern
+from bufgym_robot.wire.patterns import Pattern
 from bufgym_relay.plain import Latest
 from bufgym_relay.policies import PLACES, Rule, new_queue
 
 if TYPE_CHECKING:
-    from bufgym_robot import Item, PolicyQueue
+    from bufgym_robot.wire.queue import Item, PolicyQueue
 
 MAX_QUEUES: Final = 64  # Limit on the queues of a subscription; further topics share queues
 

@@ -14,7 +14,7 @@ from relay_cases import Client, client, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay.config import Rule
-from bufgym_relay.session import Session
+from bufgym_robot.wire.session import Session
 
 DEADLINE_S = 0.5
 LONG_S = 0.8

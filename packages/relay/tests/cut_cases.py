@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 
-from bufgym_robot.tasks import Tasks, until_one_ends
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 
 class Cuttable:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay.ledger import Ledger, Stop
+from bufgym_robot.wire.ledger import Ledger, Stop
 
 Stops = tuple[Stop, ...]
 LINKS = (("page", "near"), ("near", "far"), ("far", "robot"))

@@ -13,7 +13,7 @@ from relay_cases import ALL, Client, client, relay, settings
 
 from bufgym.traces.formats.bag_poses import typestore
 from bufgym_relay.config import Limits
-from bufgym_relay.patterns import escaped
+from bufgym_robot.wire.patterns import escaped
 
 STORE = typestore("cdr")
 made = functools.partial(ros_cases.made, STORE)

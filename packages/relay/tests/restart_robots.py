@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 from restart_truth import Truth
 
-from bufgym_relay.robot import Robot
-from bufgym_relay.session import Session
+from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire.session import Session
 
 
 class Running:

@@ -19,8 +19,8 @@ from restart_truth import LATE_S, OPEN, Goal, Said, Truth, covers
 from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay.orders import heard_stops
-from bufgym_relay.session import Session
+from bufgym_robot.wire.orders import heard_stops
+from bufgym_robot.wire.session import Session
 
 STANDS_S = 20.0
 """Time in which a robot that holds a stop stands, once all have met."""

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass, field
 
-from bufgym_relay.ledger import named
+from bufgym_robot.wire.ledger import named
 
 DEADLINE_S = 0.5
 LATE_S = 0.8

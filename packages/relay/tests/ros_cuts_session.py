@@ -13,7 +13,7 @@ from pose_cases import POSE, message
 from relay_cases import wait
 from ros_session import CONFIG, node_1, node_2
 
-from bufgym_relay import backoff
+from bufgym_robot.wire import backoff
 
 QUICK = "import sys; from bufgym_relay import backoff; backoff.MOST_S = 0.05; from bufgym.cli import main; main()"
 """The command, which connects again soon."""

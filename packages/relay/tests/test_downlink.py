@@ -10,9 +10,9 @@ from test_stops import Program
 from wire_cases import FAR, PORT, Wire, at, between, waited  # noqa: F401  (a fixture)
 
 from bufgym_relay.config import Rule
-from bufgym_relay.robot import Robot
+from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.server import Server
-from bufgym_relay.session import Session
+from bufgym_robot.wire.session import Session
 from bufgym_robot.tunnel import Tunnel
 
 ANYBODY = Rule(address="0.0.0.0/0", send=True, receive=True)

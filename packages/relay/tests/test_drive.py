@@ -11,10 +11,12 @@ from refusal_cases import refuse
 from relay_cases import client, relay, settings, until, wait
 
 from bufgym_relay.config import Rule
-from bufgym_relay.drive import STILL, TWIST, Drive, Drivers, Velocity, check_speed
-from bufgym_relay.robot import Robot
+from bufgym_relay.drivers import TWIST, Drivers, check_speed
+from bufgym_robot.fleet.drive import Drive
+from bufgym_robot.wire.driving import STILL, Velocity
+from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.rules import Identity, Permissions
-from bufgym_relay.wire import Message, RefusedError
+from bufgym_robot.wire.messages import Message, RefusedError
 
 
 def said(stamp_s: float, linear: Any = 0.5, angular: Any = 0.0, for_ms: Any = 400, sender: str = "ann") -> Message:

@@ -23,9 +23,9 @@ from bufgym_relay.audit import FILE, Audit
 from bufgym_relay.config import Rotation, Rule
 from bufgym_relay.recorder import FOLDER, Recorder
 from bufgym_relay.replay import answer_text, piece, recordings
-from bufgym_relay.wire import Message
-from bufgym_robot.mcap_file import McapFile
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.messages import Message
+from bufgym_robot.wire.mcap_file import McapFile
+from bufgym_robot.wire.sockets import free_port
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 RECORD = Rule(recorder=True, receive=True, topic="/robots/.*")
@@ -108,7 +108,7 @@ async def test_a_deleted_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_ever_new_types_fill_no_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A topic has 16 channels at most, a file 20: of 40 types on /a 16 are kept, then of five topics more four."""
-    monkeypatch.setattr("bufgym_robot.mcap_file.MAX_CHANNELS", 20)
+    monkeypatch.setattr("bufgym_robot.wire.mcap_file.MAX_CHANNELS", 20)
     record = recorder(tmp_path, [])
     for k in range(40):
         record(Message("/robots/a", b"1", "cdr", f"my/type{k}", "robot"))

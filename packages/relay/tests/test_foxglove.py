@@ -17,13 +17,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import ros_messages
+from bufgym_robot.wire import ros_messages
 from bufgym_relay.config import Foxglove, Rule
 from bufgym_relay.foxglove import Bridge, Screen
-from bufgym_relay.robot import Robot
+from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.server import Server
-from bufgym_relay.session import Session
-from bufgym_relay.wire import MAX_STAMP_US, Message
+from bufgym_robot.wire.session import Session
+from bufgym_robot.wire.messages import MAX_STAMP_US, Message
 
 CONFIG = settings(policies=("drop-oldest",))
 
@@ -55,7 +55,7 @@ class Viewer:
 
 @compiled
 async def test_a_client_of_foxglove_sees_the_fleet(corner: Corner, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bufgym_relay.robot.STATUS_S", 0.1)
+    monkeypatch.setattr("bufgym_robot.fleet.robot.STATUS_S", 0.1)
     viewer = Viewer()
     channels, came, robot = viewer.channels, viewer.came, f"/robots/{corner.robot}"
     bridge = Bridge(Session(corner.url, "foxglove"), port=0)

@@ -21,9 +21,9 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import identity
-from bufgym_relay.address import token
+from bufgym_robot.wire.address import token
 from bufgym_relay.config import Rule, Tls, Tokens
-from bufgym_relay.session import Session
+from bufgym_robot.wire.session import Session
 
 jwt = pytest.importorskip("jwt", reason=needs("extras", "jwt"))
 x509 = pytest.importorskip("cryptography.x509", reason=needs("extras", "cryptography.x509"))

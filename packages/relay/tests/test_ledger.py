@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay.kept import Kept, place
-from bufgym_relay.ledger import MOST_HELD, MOST_RELEASED, Ledger, Stop, named, read
+from bufgym_robot.fleet.kept import Kept, place
+from bufgym_robot.wire.ledger import MOST_HELD, MOST_RELEASED, Ledger, Stop, named, read
 
 ids = st.sampled_from(["ann", "bob"])
 stops = st.builds(Stop, ids, st.integers(1, 3), ids, st.integers(1, 3), ids, st.integers(0, 2))

@@ -12,10 +12,10 @@ from relay_cases import client, nothing, relay, settings, until, untrusted, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import Nats, StoreLimits
-from bufgym_relay.clock import Delays
+from bufgym_robot.wire.clock import Delays
 from bufgym_relay.hub import Hub
 from bufgym_relay.peers import Peers
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 pytestmark = needs_server
 
@@ -25,7 +25,7 @@ def _hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Relays wait little for NATS."""
     for name in ("ANSWER_S", "ASK_S"):
         monkeypatch.setattr(f"bufgym_relay.bus.{name}", 0.5)
-    monkeypatch.setattr("bufgym_relay.backoff.MOST_S", 0.1)
+    monkeypatch.setattr("bufgym_robot.wire.backoff.MOST_S", 0.1)
 
 
 async def test_relays_hear_each_other_again_after_nats_has_stood_still(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from test_page_fleet import text  # noqa: E402
 from test_stops import Program  # noqa: E402
 
 from bufgym_relay.config import Limits, Rule  # noqa: E402
-from bufgym_relay.robot import Robot  # noqa: E402
+from bufgym_robot.fleet.robot import Robot  # noqa: E402
 
 pytestmark = compiled
 HOUR_S = 3600.0

@@ -17,7 +17,7 @@ from test_page_fleet import PLACE, text  # noqa: E402
 from test_page_keys import ALL_COMMANDS, Yard, came, drives, parked  # noqa: E402
 
 from bufgym_relay.config import Rule  # noqa: E402
-from bufgym_relay.drive import Drive  # noqa: E402
+from bufgym_robot.fleet.drive import Drive  # noqa: E402
 
 pytestmark = compiled
 

@@ -22,7 +22,7 @@ from PIL import Image  # noqa: E402
 from pose_cases import ESTIMATE, POSE  # noqa: E402
 from test_page import SEES, until  # noqa: E402
 
-from bufgym_relay import ros_messages  # noqa: E402
+from bufgym_robot.wire import ros_messages  # noqa: E402
 
 pytestmark = compiled
 RED = jpeg(np.full((120, 160, 3), (220, 30, 30), np.uint8))

@@ -21,7 +21,7 @@ from test_page_fleet import PLACE, text  # noqa: E402
 from websockets.exceptions import ConnectionClosed  # noqa: E402
 
 from bufgym_relay.config import Limits  # noqa: E402
-from bufgym_relay.wire import Message  # noqa: E402
+from bufgym_robot.wire.messages import Message  # noqa: E402
 
 pytestmark = compiled
 

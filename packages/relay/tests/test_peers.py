@@ -12,8 +12,8 @@ from relay_cases import client, nothing, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import Rule, Server, StoreLimits, bus
-from bufgym_relay.wire import Message, RefusedError, encode
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.messages import Message, RefusedError, encode
+from bufgym_robot.wire.sockets import free_port
 
 pytestmark = needs_server
 _NUMBERS = itertools.count()

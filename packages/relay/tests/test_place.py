@@ -15,9 +15,9 @@ pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 
 from bufgym.traces import read_workload
 from bufgym.traces.formats.bag_poses import ODOMETRY, carries_poses
-from bufgym_relay.bag import BagSource
-from bufgym_relay.place import Place
-from bufgym_relay.robot import Robot
+from bufgym_robot.fleet.bag import BagSource
+from bufgym_robot.wire.place import Place
+from bufgym_robot.fleet.robot import Robot
 from tests.traces.bag_cases import write_mcap
 
 Said = tuple[str, str, float, str]
@@ -133,8 +133,8 @@ def played(path: Path, named: str | None) -> Place:
         """Play without waiting."""
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bufgym_relay.bag.asyncio.sleep", at_once)
-        patch.setattr("bufgym_relay.bag._LATE_S", math.inf)
+        patch.setattr("bufgym_robot.fleet.bag.asyncio.sleep", at_once)
+        patch.setattr("bufgym_robot.fleet.bag._LATE_S", math.inf)
         asyncio.run(robot.source.run(robot))
     return robot.place
 

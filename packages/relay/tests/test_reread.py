@@ -12,7 +12,7 @@ from test_identity import HERE, Authority
 from bufgym.utils.errors import BufgymError
 from bufgym_relay.config import Rule, Tls
 from bufgym_relay.rules import Identity, Permissions
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 
 async def test_new_rules_hold_for_who_is_here() -> None:

@@ -17,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 
 from bufgym_relay import robofleet
 from bufgym_relay.config import Limits
-from bufgym_relay.wire import WireError
+from bufgym_robot.wire.messages import WireError
 
 flatbuffers = pytest.importorskip("flatbuffers", reason=needs("extras", "flatbuffers"))
 

@@ -21,11 +21,12 @@ from websockets.exceptions import ConnectionClosedError
 from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import robot, ros_messages, wire
-from bufgym_relay.bag import BagSource
-from bufgym_relay.monitor import Monitor
-from bufgym_relay.robot import Robot
-from bufgym_relay.session import Session
+from bufgym_robot.fleet import robot
+from bufgym_robot.wire import ros_messages, messages as wire
+from bufgym_robot.fleet.bag import BagSource
+from bufgym_robot.fleet.monitor import Monitor
+from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire.session import Session
 
 pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 pytest.importorskip("PIL", reason=needs("extras", "PIL"))

@@ -10,7 +10,7 @@ from relay_cases import ALL, client, relay, settings
 from bufgym_relay.config import Rule
 from bufgym_relay.roster import MOST_ROBOTS, Roster
 from bufgym_relay.store import Store
-from bufgym_relay.wire import Message
+from bufgym_robot.wire.messages import Message
 
 STATUS = {"ok": True, "text": "charges", "battery": 0.5, "location": {"x": 1, "y": 2, "yaw": 0, "frame": "map"}}
 

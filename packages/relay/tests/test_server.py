@@ -18,7 +18,7 @@ from bufgym.utils.errors import BufgymError
 from bufgym_relay import policies
 from bufgym_relay import server as serving
 from bufgym_relay.config import Limits, Rule
-from bufgym_relay.wire import Message
+from bufgym_robot.wire.messages import Message
 
 
 async def test_a_message_goes_to_each_subscriber_but_its_sender(corner: Corner) -> None:

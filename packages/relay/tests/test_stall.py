@@ -18,7 +18,7 @@ from bufgym_relay.audit import FILE, _Lines
 from bufgym_relay.config import Limits, StoreLimits
 from bufgym_relay.held import Held
 from bufgym_relay.server import Server
-from bufgym_relay.session import Session
+from bufgym_robot.wire.session import Session
 
 COMMAND, PICTURE = "/robots/a/command", "/robots/a/camera"
 

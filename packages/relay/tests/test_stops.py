@@ -13,16 +13,18 @@ from loop_cases import beside, compiled
 from relay_cases import client, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import backoff
-from bufgym_relay.clock import RelayClock
+from bufgym_robot.wire import backoff
+from bufgym_robot.wire.clock import RelayClock
 from bufgym_relay.config import Rule
-from bufgym_relay.drive import STILL, Drive, Velocity
-from bufgym_relay.ledger import Stop
-from bufgym_relay.orders import Orders, moves
-from bufgym_relay.robot import Robot
-from bufgym_relay.ros import Ros1
-from bufgym_relay.session import Session
-from bufgym_relay.wire import Message, RefusedError
+from bufgym_robot.fleet.drive import Drive
+from bufgym_robot.wire.driving import STILL, Velocity
+from bufgym_robot.wire.ledger import Stop
+from bufgym_relay.orders import Orders
+from bufgym_robot.wire.orders import moves
+from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.fleet.ros import Ros1
+from bufgym_robot.wire.session import Session
+from bufgym_robot.wire.messages import Message, RefusedError
 
 COMMAND, STOP = "/robots/r/command", "/robots/r/stop"
 

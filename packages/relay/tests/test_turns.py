@@ -13,7 +13,8 @@ import pytest
 from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
-from bufgym_relay import caller, outbox, replay, server, turns, wire
+from bufgym_relay import caller, outbox, replay, server, turns
+from bufgym_robot.wire import messages as wire
 from bufgym_relay.connection import Connection
 from bufgym_relay.hub import MOST_IN_TURN
 from bufgym_relay.outgoing import Outgoing

@@ -15,8 +15,8 @@ from relay_cases import Corner, until, within
 
 from bufgym.model.link import Link
 from bufgym.traces import Trace
-from bufgym_relay import wire
-from bufgym_relay.wire import Message
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.messages import Message
 from bufgym_robot.shaped import ShapedLink
 
 REPO = Path(__file__).resolve().parents[3]

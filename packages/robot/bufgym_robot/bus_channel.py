@@ -21,7 +21,7 @@ from typing import Any, Final, Protocol
 from weakref import WeakSet
 
 from bufgym_robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, whole
-from bufgym_robot.sockets import (
+from bufgym_robot.wire.sockets import (
     BACKOFF_S,
     bounded_backoff,
     connections_to,

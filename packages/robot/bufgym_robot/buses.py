@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from bufgym.utils.libraries import needs
 from bufgym_robot.bus_channel import Hear, Open, Peer
-from bufgym_robot.sockets import DEAD_AFTER_S, host_port
+from bufgym_robot.wire.sockets import DEAD_AFTER_S, host_port
 
 ROOT: Final = "bufgym"
 MQTT_PORT: Final = 1883  # Standard port of an MQTT broker
@@ -27,7 +27,7 @@ class ZenohBus:
     """A Zenoh session. Its full queue blocks the sender; by default it would drop."""
 
     def __init__(self, host: str, port: int, name: str, hear: Hear, peer: Peer) -> None:
-        with needs("zenoh", "bufgym-live[zenoh]"):
+        with needs("zenoh", "bufgym-robot[zenoh]"):
             import zenoh
         self._zenoh, self._name = zenoh, name
         config = zenoh.Config()

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from bufgym_robot.bus_channel import BusChannel
 from bufgym_robot.buses import BUSES
 from bufgym_robot.frames import HEADER_BYTES, MAX_BODY_BYTES, Frame, Room, header, parse, whole
-from bufgym_robot.sockets import BACKOFF_S, connected, host_port, unsent_bytes, until_writable
+from bufgym_robot.wire.sockets import BACKOFF_S, connected, host_port, unsent_bytes, until_writable
 
 PIECE_BYTES: Final = 16_384
 """Bytes written at a time, so that ``left_bytes`` is known while a large message is under way."""

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from bufgym.cli.options import Count, Least0, PolicyFile, PortNumber, Positive, checked, one_policy
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S, host_port
+from bufgym_robot.wire.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S, host_port
 
 if TYPE_CHECKING:
     from bufgym_robot.sender import Sender
@@ -92,7 +92,7 @@ async def send(
     from bufgym.model import qoi
     from bufgym_robot import LogFile, PolicyQueue
     from bufgym_robot.channels import TRANSPORTS
-    from bufgym_robot.log import Record
+    from bufgym_robot.wire.log import Record
     from bufgym_robot.sender import Leaves, Sender
     from bufgym_robot.view import View
 
@@ -170,7 +170,7 @@ async def receive(
         out: Write received messages to this file (.mcap).
         messages: Stop after so many.
     """
-    from bufgym_robot.mcap_file import MAX_CHANNELS
+    from bufgym_robot.wire.mcap_file import MAX_CHANNELS
     from bufgym_robot.receiver import Received, Receiver, Recording
 
     host, port = listens_at(at, host, port)

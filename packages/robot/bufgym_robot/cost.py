@@ -11,7 +11,7 @@ import numpy as np
 
 from bufgym.cli.options import Positive
 from bufgym.utils.tables import Table
-from bufgym_robot.queue import PolicyQueue
+from bufgym_robot.wire.queue import PolicyQueue
 
 POLICIES = ("drop-oldest", "afr", "learned")
 RATE_HZ, SIZE_BYTES, CAPACITY = 30.0, 230_000, 16  # Frames that the camera puts, and the queue's L

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from bufgym_robot.channels import Channel
-from bufgym_robot.sockets import PACKET_BYTES, Heard, drop_unacked, heard, moved_to, segment_bytes
+from bufgym_robot.wire.sockets import PACKET_BYTES, Heard, drop_unacked, heard, moved_to, segment_bytes
 
 PING_S: Final = 1.0  # Time without a sign of life after which a connection with nothing on its way is asked for one
 SILENT_S: Final = 2.0  # Time without a sign of life after which a second connection is tried

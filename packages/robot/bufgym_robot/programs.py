@@ -21,7 +21,7 @@ from bufgym.scenario import Episode
 from bufgym.traces import MotionSettings
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.processes import end_with
-from bufgym_robot.queue import PolicyQueue
+from bufgym_robot.wire.queue import PolicyQueue
 from bufgym_robot.receiver import Received
 
 CAMERA, ODOMETRY = "/camera", "/odom"

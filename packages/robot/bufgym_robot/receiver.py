@@ -31,9 +31,9 @@ from bufgym_robot.frames import (
     FrameError,
     Room,
 )
-from bufgym_robot.mcap_file import McapFile
-from bufgym_robot.sockets import BACKOFF_S, bounded_backoff, free_port, host_port
-from bufgym_robot.tasks import Tasks
+from bufgym_robot.wire.mcap_file import McapFile
+from bufgym_robot.wire.sockets import BACKOFF_S, bounded_backoff, free_port, host_port
+from bufgym_robot.wire.tasks import Tasks
 
 MAX_STREAMS: Final = 64  # Number of latest senders that are remembered
 MAX_PEERS: Final = 2 * MAX_STREAMS  # Connections at a time, with those that senders have given up

@@ -18,7 +18,7 @@ from bufgym.sim.metrics import Outcome, outcome
 from bufgym.sim.state import NEVER
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.log import Record, of, read_log, value_of
+from bufgym_robot.wire.log import Record, of, read_log, value_of
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from bufgym_robot.frames import ACK, DATA, GOODBYE, GREETING, LATCHED, PING, STR
 from bufgym_robot.latched import Latched
 from bufgym_robot.path_watch import PathWatch
 from bufgym_robot.path_window import PathWindow
-from bufgym_robot.queue import Item, PolicyQueue
-from bufgym_robot.tasks import until_one_ends
+from bufgym_robot.wire.queue import Item, PolicyQueue
+from bufgym_robot.wire.tasks import until_one_ends
 
 Leaves = Literal["sent", "acked", "written"]
 """Event at which a message has left.

@@ -16,7 +16,7 @@ from typing import Final
 
 from bufgym.model.link import FOREVER, Link
 from bufgym_robot.receiver import listener
-from bufgym_robot.tasks import Tasks, until_one_ends
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 RECEIVE_BUFFER_BYTES: Final = 16_384
 _PIECE_BYTES: Final = 16_384

@@ -4,7 +4,7 @@ from collections import Counter, deque
 from collections.abc import Iterable
 from typing import Final
 
-from bufgym_robot.log import Record, value_of
+from bufgym_robot.wire.log import Record, value_of
 
 RATE_US: Final = 1_000_000  # Time before now over which rates are computed
 HISTORY_S: Final = 60

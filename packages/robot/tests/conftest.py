@@ -13,7 +13,7 @@ from needs import needs
 from wire_cases import between  # noqa: F401  (a fixture)
 
 from bufgym_robot import sender
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 
 @pytest.fixture(autouse=True)

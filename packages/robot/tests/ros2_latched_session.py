@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros2_session import BASE, LATCHED, ROBOT, Side, processes, start
 from std_msgs.msg import String
 
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 DRIVERS = 40
 STATES = ("/tf_static", "/map", "/description")

@@ -14,7 +14,7 @@ from pathlib import Path
 from ros2_session import BASE, ROBOT, Side, processes, start
 from std_msgs.msg import String
 
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 RESTARTS = 5
 

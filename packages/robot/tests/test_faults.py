@@ -27,7 +27,7 @@ from bufgym_robot.frames import ACK, DATA, GOODBYE, GREETING, HEADER_BYTES, Fram
 from bufgym_robot.receiver import Received, Recording, listener
 from bufgym_robot.sender import Sender
 from bufgym_robot.shaped import ShapedLink
-from bufgym_robot.tasks import Tasks
+from bufgym_robot.wire.tasks import Tasks
 
 CUT_S = float(os.environ.get("BUFGYM_CUT_S", "5"))
 """The long cut; by hand also BUFGYM_CUT_S=60."""
@@ -281,7 +281,7 @@ def test_what_comes_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     """Also from a clock far beyond any; a topic beyond the file's two channels is left out."""
     from mcap.reader import make_reader
 
-    monkeypatch.setattr("bufgym_robot.mcap_file.MAX_CHANNELS", 2)
+    monkeypatch.setattr("bufgym_robot.wire.mcap_file.MAX_CHANNELS", 2)
     with Recording(tmp_path / "came.mcap") as recording:
         for topic, at_us in ((2, 2**64 - 1), (3, 5_000), (2, 5_000)):
             recording(Received("ab", 0, 7, at_us, 1.5, topic, b"frame", 10**9))

@@ -25,7 +25,7 @@ from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
 from bufgym_robot import programs as live
-from bufgym_robot.odometry import Odometry
+from bufgym_robot.wire.odometry import Odometry
 from bufgym_robot.programs import pose_stamp, publish_in_time, received, running
 from bufgym_robot.ros1 import episode as ros1
 from bufgym_robot.ros2 import episode as ros2

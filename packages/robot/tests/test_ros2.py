@@ -26,7 +26,7 @@ from bufgym.scenario import Stream, read_client
 from bufgym.utils.errors import BufgymError
 from bufgym_robot import PolicyQueue, replay
 from bufgym_robot.frames import FrameError
-from bufgym_robot.log import of, read_log
+from bufgym_robot.wire.log import of, read_log
 from bufgym_robot.ros2 import relay
 from bufgym_robot.ros2.diagnostics import Diagnostics
 from bufgym_robot.ros2.names import Published, parse

@@ -19,7 +19,7 @@ from refusal_cases import refuse
 from roscpp_cases import block, build, gone, missing, publishers, seqs, subscriber
 
 from bufgym_robot import read_log, roscpp
-from bufgym_robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 pytestmark = pytest.mark.timeout(600)  # the build takes seconds, and minutes beside other work
 

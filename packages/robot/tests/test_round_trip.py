@@ -28,7 +28,8 @@ from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
-from bufgym_robot import PolicyQueue, far, sockets, tunnel
+from bufgym_robot import PolicyQueue, far, tunnel
+from bufgym_robot.wire import sockets
 from bufgym_robot.frames import ACK, Frame
 from bufgym_robot.path_window import PathWindow
 from bufgym_robot.sender import Sender

@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from bufgym_robot.sockets import address_to, end_connections_from, is_gone
+from bufgym_robot.wire.sockets import address_to, end_connections_from, is_gone
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "0.0.0.0", "robot-7", "localhost", ""])

@@ -21,13 +21,13 @@ from bufgym_robot import PolicyQueue, replay
 from bufgym_robot.bus_channel import BusChannel
 from bufgym_robot.channels import TRANSPORTS, WebSocketChannel
 from bufgym_robot.frames import DATA, GREETING, HEADER_BYTES, Frame, Room, header
-from bufgym_robot.log import Record
+from bufgym_robot.wire.log import Record
 from bufgym_robot.margins import margins
 from bufgym_robot.receiver import Received
 from bufgym_robot.runs import LiveRun, orders, table
 from bufgym_robot.sender import Sender
 from bufgym_robot.shaped import ShapedLink
-from bufgym_robot.tasks import Tasks
+from bufgym_robot.wire.tasks import Tasks
 from bufgym_robot.validate import over, play, validate
 
 V = qoi.exponential(0.618)
@@ -246,7 +246,7 @@ def test_a_program_ends_once_its_library_has_left() -> None:
 
 
 async def test_what_loses_its_cancellation_is_cancelled_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bufgym_robot.tasks.AGAIN_S", 0.01)
+    monkeypatch.setattr("bufgym_robot.wire.tasks.AGAIN_S", 0.01)
 
     async def deaf() -> None:
         with contextlib.suppress(asyncio.CancelledError):

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S
+from bufgym_robot.wire.sockets import BACKOFF_S, LEAST_BACKOFF_S, MOST_BACKOFF_S
 
 if TYPE_CHECKING:  # the command says first whether policies run compiled, and these would import the compiler
     from bufgym.model.qoi import Value
     from bufgym.policies.registry import Policy
     from bufgym.traces import MotionSettings
-    from bufgym_robot.odometry import Odometry
+    from bufgym_robot.wire.odometry import Odometry
 
 UNTOUCHED: Final = ("/rosout", "/tf", "/tf_static", "/clock")
 """Small topics that every node reads. A policy named for one of them still rules it."""
@@ -75,7 +75,7 @@ def install(
     from bufgym.model.buffer import MAX_CAPACITY
     from bufgym.model.checks import between
     from bufgym_robot import LogFile, PolicyQueue
-    from bufgym_robot.odometry import followed
+    from bufgym_robot.wire.odometry import followed
     from bufgym_robot.ros1 import new_address
     from bufgym_robot.ros1.connection import PolicyConnection
 

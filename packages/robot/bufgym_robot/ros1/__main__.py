@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bufgym.utils.errors import BufgymError
 from bufgym_robot import ros1
-from bufgym_robot.sockets import BACKOFF_S
+from bufgym_robot.wire.sockets import BACKOFF_S
 
 RULES = "also mine.safetensors or module:function, whose code is run; 'rospy': rospy's own queue"
 

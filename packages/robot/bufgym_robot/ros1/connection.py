@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from bufgym_robot import LogFile, PolicyQueue
 from bufgym_robot.channels import PIECE_BYTES
-from bufgym_robot.sockets import BACKOFF_S, bounded_backoff, is_writable, little_unsent, set_option, unsent_bytes
+from bufgym_robot.wire.sockets import BACKOFF_S, bounded_backoff, is_writable, little_unsent, set_option, unsent_bytes
 
 _LOOK_S: Final = 0.1  # Time between two looks at whether the connection was closed
 _DEAD_AFTER_S: Final = 900.0

@@ -14,7 +14,7 @@ import xmlrpc.client
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from bufgym_robot.sockets import address_to, end_connections_from, is_gone
+from bufgym_robot.wire.sockets import address_to, end_connections_from, is_gone
 
 _LOOK_S: Final = 0.5  # Time between two looks at the address
 _PATIENCE_S: Final = 1.0  # Time for the master to answer

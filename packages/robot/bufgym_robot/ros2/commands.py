@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from bufgym.cli.options import Count, Least0, PolicyFile, one_policy
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.commands import PORT, RECEIVER, Backoff, Host, Port, Transport, Window, address, listens_at, say
-from bufgym_robot.sockets import BACKOFF_S, host_port
+from bufgym_robot.wire.sockets import BACKOFF_S, host_port
 
 RosArgs = Annotated[
     tuple[str, ...],
@@ -53,7 +53,7 @@ async def send(
     from bufgym.scenario import read_client
     from bufgym_robot import LogFile
     from bufgym_robot.ros2.relay import SENDER, RosSender, own_node
-    from bufgym_robot.row import refuse_rivals
+    from bufgym_robot.wire.row import refuse_rivals
 
     client = None if config is None else read_client(config)
     if policies is not None:

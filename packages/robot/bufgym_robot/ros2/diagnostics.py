@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bufgym.model.qoi import Value
-from bufgym_robot.log import Record
+from bufgym_robot.wire.log import Record
 
 
 @dataclass

@@ -24,7 +24,7 @@ from bufgym.policies.registry import Policy
 from bufgym.scenario import Client, Episode, Stream
 from bufgym.traces import Trace, load_motion
 from bufgym_robot import PolicyQueue, programs
-from bufgym_robot.log import Record, of
+from bufgym_robot.wire.log import Record, of
 from bufgym_robot.receiver import Received
 from bufgym_robot.ros2.names import needs_rclpy
 from bufgym_robot.ros2.relay import RosSender, receive

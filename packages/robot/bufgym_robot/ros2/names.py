@@ -31,7 +31,7 @@ def needs_rclpy() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise BufgymError(
-            f"bufgym_robot.ros2 needs {error.name}: source ROS 2's set-up, or {install('bufgym-live[ros2]')}"
+            f"bufgym_robot.ros2 needs {error.name}: source ROS 2's set-up, or {install('bufgym-robot[ros2]')}"
         ) from None
 
 

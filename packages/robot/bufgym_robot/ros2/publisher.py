@@ -47,7 +47,7 @@ class Publisher:
             queue_size: L, messages.
             reliable, depth: quality of service at the other end.
             value: V; 1 - 0.618^d by default.
-            x: returns the scene's motion now, such as ``bufgym_robot.odometry``; by default it counts messages.
+            x: returns the scene's motion now, such as ``bufgym_robot.wire.odometry``; by default it counts messages.
             log: log of every decision.
         """
         package, name = msg_type.__module__.split(".")[0], msg_type.__name__

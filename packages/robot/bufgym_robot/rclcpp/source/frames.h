@@ -1,4 +1,4 @@
-// Frames of bufgym's TCP connection (bufgym_live/robot/frames.py), and the head of a message of ROS 2 (ros2/names.py).
+// Frames of bufgym's TCP connection (bufgym_robot/frames.py), and the head of a message of ROS 2 (ros2/names.py).
 // All numbers are big-endian.
 #ifndef BUFGYM_SENDER_FRAMES_H
 #define BUFGYM_SENDER_FRAMES_H

@@ -1,5 +1,5 @@
 // A sender's connections, and a watch over their path: a second one races one on which nothing is heard
-// (bufgym_live/robot/path_watch.py). No ROS here.
+// (bufgym_robot/path_watch.py). No ROS here.
 #ifndef BUFGYM_SENDER_PATH_H
 #define BUFGYM_SENDER_PATH_H
 #include <cstdint>

@@ -1,4 +1,4 @@
-// x: how far the scene has moved on, in fields of view, summed from a robot's odometry (bufgym_live/robot/odometry.py).
+// x: how far the scene has moved on, in fields of view, summed from a robot's odometry (bufgym_robot/wire/odometry.py).
 #ifndef BUFGYM_ROSCPP_MOTION_H
 #define BUFGYM_ROSCPP_MOTION_H
 #include <algorithm>

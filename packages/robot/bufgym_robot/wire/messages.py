@@ -163,6 +163,14 @@ def check_name(what: str, name: str) -> None:
         raise WireError(f"{what} {name!r}: must be printable, at most {MAX_NAME_BYTES} bytes")
 
 
+def check_robot(name: str) -> None:
+    """Raise WireError if a robot's topics cannot have this name."""
+    check_name("robot", name)
+    longest = MAX_NAME_BYTES - len("/robots//command")
+    if not name or "/" in name or len(name.encode()) > longest:
+        raise WireError(f"robot {name!r}: must be a printable text without '/' of at most {longest} bytes")
+
+
 def is_name(name: str) -> bool:
     """Whether it may be a name."""
     return name.isprintable() and len(name.encode()) <= MAX_NAME_BYTES

@@ -9,7 +9,7 @@ from typing import Any, Final
 from bufgym.model import qoi
 from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
-from bufgym_robot.log import Record
+from bufgym_robot.wire.log import Record
 
 RATE_S: Final = 1.0  # Time before now over which rates are computed
 QOI_S: Final = 30.0  # Time before now whose messages count for QoI

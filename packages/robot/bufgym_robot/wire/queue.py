@@ -30,8 +30,8 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.log import LogFile, Record, settings
-from bufgym_robot.row import ROOM, LiveRow
+from bufgym_robot.wire.log import LogFile, Record, settings
+from bufgym_robot.wire.row import ROOM, LiveRow
 
 FIRST_US: Final = 2  # Earliest time of a call; the two first knots of a link lie before it
 MAX_SIZE_BYTES: Final = 2**40  # Size limit of a message; sums over months then stay within 64 bits

@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
-from bufgym_relay.clock import ASK_S, RelayClock
-from bufgym_relay.orders import COMMAND_S, is_stop, right, robot_of
-from bufgym_relay.patterns import pattern
-from bufgym_relay.wire import Message, RefusedError
+from bufgym_robot.wire.clock import ASK_S, RelayClock
+from bufgym_robot.wire.orders import COMMAND_S, is_stop, right, robot_of
+from bufgym_robot.wire.patterns import pattern
+from bufgym_robot.wire.messages import Message, RefusedError
 
 
 class Deadlines:

@@ -9,8 +9,8 @@ import math
 from typing import Any
 
 from bufgym.traces.formats.bag_poses import ODOMETRY, Frames, carries_poses
-from bufgym_relay import ros_messages
-from bufgym_robot.odometry import Odometry, followed
+from bufgym_robot.wire import ros_messages
+from bufgym_robot.wire.odometry import Odometry, followed
 
 
 class Place:

@@ -4,8 +4,8 @@ A robot's topics lie under ``/robots/NAME/``. Besides its source's topics it pub
 ``status`` once a second, with battery, location, network, queue and the list of topics. The command ``{"command":
 "policy", "policy": "afr"}`` on its topic ``command`` changes its queue's policy. Its status answers the latest command
 by the command's ``id``, with the reason ``why`` if it was refused. Messages on its topic ``drive`` move it as
-``bufgym_relay.drive`` says. A command later than its deadline is refused. A stop on its topic ``stop`` holds as
-``bufgym_relay.latch`` says.
+``bufgym_robot.fleet.drive`` says. A command later than its deadline is refused. A stop on its topic ``stop`` holds as
+``bufgym_robot.fleet.latch`` says.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Stream
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import wire
-from bufgym_relay.claims import check_name
-from bufgym_relay.client import RobotClient
-from bufgym_relay.drive import TOPIC, Drive, Velocity
-from bufgym_relay.kept import Kept, place
-from bufgym_relay.latch import Latch
-from bufgym_relay.ledger import Stop
-from bufgym_relay.monitor import Monitor
-from bufgym_relay.orders import STOP, heard_stops
-from bufgym_relay.patterns import exactly
-from bufgym_relay.place import Place
-from bufgym_robot.tasks import Tasks, until_one_ends
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.fleet.drive import Drive
+from bufgym_robot.wire.driving import TOPIC, Velocity
+from bufgym_robot.fleet.kept import Kept, place
+from bufgym_robot.fleet.latch import Latch
+from bufgym_robot.wire.ledger import Stop
+from bufgym_robot.fleet.monitor import Monitor
+from bufgym_robot.wire.orders import STOP, heard_stops
+from bufgym_robot.wire.patterns import exactly
+from bufgym_robot.wire.place import Place
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 STATUS_S: Final = 1.0
 QUEUE_S: Final = 0.2
@@ -92,9 +92,9 @@ class Robot:
         """Arguments as for ``RobotClient``; a command may choose one of ``policies``.
 
         ``odometry`` names the source's topic that says where the robot is and gives x, as
-        ``bufgym_relay.place`` says.
+        ``bufgym_robot.wire.place`` says.
         """
-        check_name(name)
+        wire.check_robot(name)
         self.name, self.source = name, source
         streams = [*source.streams]
         streams += [own for own in _OWN if own.topic.name not in {stream.topic.name for stream in streams}]

@@ -8,7 +8,7 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from bufgym_relay.ledger import Ledger, Stop, read
+from bufgym_robot.wire.ledger import Ledger, Stop, read
 
 _MOST_BYTES: Final = 2**20
 

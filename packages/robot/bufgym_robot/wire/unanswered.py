@@ -11,12 +11,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import wire
-from bufgym_relay.orders import robot_of
-from bufgym_relay.stored import UNKNOWN
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.orders import robot_of
 
+UNKNOWN: Final = "nobody knows whether it was executed"
 AGAIN = ("out_of_order", "busy")
 """Codes of refusals after which a message is sent again: it is behind a refused one, or the relay's disk stalls."""
 

@@ -22,7 +22,7 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.mcap_file import McapFile
+from bufgym_robot.wire.mcap_file import McapFile
 
 Record = dict[str, Any]
 

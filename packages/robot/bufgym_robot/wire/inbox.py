@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Final
 
-from bufgym_relay.wire import HEADER_BYTES, Message
+from bufgym_robot.wire.messages import HEADER_BYTES, Message
 
 MOST_BYTES: Final = 2**20  # Most bytes that wait beside the newest; the oldest messages go, except no_drop ones
 

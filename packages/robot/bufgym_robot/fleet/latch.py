@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import Iterable
 from typing import Any
 
-from bufgym_relay.ledger import Ledger, Stop
-from bufgym_relay.orders import moves
-from bufgym_relay.wire import Message
+from bufgym_robot.wire.ledger import Ledger, Stop
+from bufgym_robot.wire.orders import moves
+from bufgym_robot.wire.messages import Message
 
 
 class Latch:

@@ -25,11 +25,11 @@ from bufgym.model.qoi import Value
 from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import wire
-from bufgym_relay.session import Session
-from bufgym_robot.log import Record
-from bufgym_robot.queue import Item, PolicyQueue
-from bufgym_robot.sockets import unsent_bytes, until_writable
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.session import Session
+from bufgym_robot.wire.log import Record
+from bufgym_robot.wire.queue import Item, PolicyQueue
+from bufgym_robot.wire.sockets import unsent_bytes, until_writable
 
 
 @dataclass(eq=False)

@@ -18,17 +18,17 @@ from collections.abc import Callable, Container, Coroutine
 from typing import Any, Final
 from urllib.parse import SplitResult
 
-from bufgym_relay import address, wire
-from bufgym_relay.backoff import Backoff
-from bufgym_relay.deadlines import Deadlines
-from bufgym_relay.inbox import Inbox
-from bufgym_relay.orders import is_stop
-from bufgym_relay.patterns import Pattern, pattern
-from bufgym_relay.stops import Stops
-from bufgym_relay.unanswered import Unanswered
-from bufgym_relay.wanted import OnMessage, Wanted
-from bufgym_relay.wire import RefusedError
-from bufgym_robot.tasks import Tasks, until_one_ends
+from bufgym_robot.wire import address, messages as wire
+from bufgym_robot.wire.backoff import Backoff
+from bufgym_robot.wire.deadlines import Deadlines
+from bufgym_robot.wire.inbox import Inbox
+from bufgym_robot.wire.orders import is_stop
+from bufgym_robot.wire.patterns import Pattern, pattern
+from bufgym_robot.wire.stops import Stops
+from bufgym_robot.wire.unanswered import Unanswered
+from bufgym_robot.wire.wanted import OnMessage, Wanted
+from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 MOST_WHYS: Final = 64  # Refused commands of which a new connection tells
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome
@@ -233,7 +233,7 @@ class Session:
         self.faults.append(fault)
 
     async def _connect(self) -> Any:
-        from bufgym_relay.client_connection import connected  # not at start-up
+        from bufgym_robot.wire.client_connection import connected  # not at start-up
 
         return await connected(self.address, self._tls)
 

@@ -9,8 +9,8 @@ from urllib.parse import SplitResult, urlsplit
 
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.files import read_utf8
-from bufgym_relay import wire
-from bufgym_robot.sockets import connected
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.sockets import connected
 
 TOKEN_VARIABLE: Final = "BUFGYM_RELAY_TOKEN"
 _MAX_TOKEN_BYTES: Final = 2**16

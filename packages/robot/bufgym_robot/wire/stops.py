@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import wire
-from bufgym_relay.orders import STOP
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.orders import STOP
 
 
 class Stops:
