@@ -29,10 +29,10 @@ import numpy as np
 
 from bufgym.model import Link
 from bufgym.utils.errors import BufgymError
-from bufgym_robot import read_log, replay, tunnel
-from bufgym_robot.programs import running
 from bufgym_papers.figures.figure import COLOURS, Figure, at_least_0, finish, legend_below, several
 from bufgym_papers.figures.rows import FigureRows
+from bufgym_robot import read_log, replay, tunnel
+from bufgym_robot.programs import running
 from studies.round_trips import CAPACITY, RATE_HZ, SIZE_BYTES, V, link
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "live" / "tests" / "robot"))

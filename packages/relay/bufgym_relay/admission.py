@@ -19,10 +19,10 @@ from websockets.http11 import Request
 from websockets.protocol import Event, State
 
 from bufgym_relay import turns
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Limits
 from bufgym_relay.hub import Hub
 from bufgym_relay.rules import Identity, Permissions, plain_address
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.sockets import BACKOFF_S, DEAD_AFTER_S, bounded_backoff, little_unsent, set_option
 

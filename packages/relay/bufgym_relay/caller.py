@@ -8,12 +8,12 @@ from typing import Any, Final
 from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.admission import POLICY_VIOLATION, Accepted
 from bufgym_relay.hub import Hub
 from bufgym_relay.identity import Verifier, certificate_email
 from bufgym_relay.rules import Identity, plain_address
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import RefusedError
 
 _FRAME_BYTES: Final = 500  # bytes of JSON whose parsing takes as long as all else that is done for a frame

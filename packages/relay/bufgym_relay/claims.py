@@ -5,11 +5,11 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
 from bufgym_relay.rules import Identity, Permissions
 from bufgym_relay.store import Store
 from bufgym_relay.stored import StoredSession
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import RefusedError
 
 SILENT_S: Final = 3.0

@@ -12,24 +12,24 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import outbox, policies, protocol, replay
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.admission import POLICY_VIOLATION
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import Rule
 from bufgym_relay.drivers import check_speed
-from bufgym_robot.wire.orders import is_stop, order, robot_of
 from bufgym_relay.outbox import Outbox
 from bufgym_relay.outgoing import Outgoing
-from bufgym_robot.wire.patterns import pattern
 from bufgym_relay.protocol import Admitted
 from bufgym_relay.quota import Quota
 from bufgym_relay.recorder import FOLDER as RECORDINGS
 from bufgym_relay.roster import is_last
 from bufgym_relay.rules import Permissions
-from bufgym_robot.wire.unanswered import UNKNOWN
 from bufgym_relay.stored import StoredSession, command_number
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.orders import is_stop, order, robot_of
+from bufgym_robot.wire.patterns import pattern
+from bufgym_robot.wire.unanswered import UNKNOWN
 
 Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello

@@ -5,15 +5,15 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
-from bufgym_robot.wire.ledger import Stop
 from bufgym_relay.orders import Orders
-from bufgym_robot.wire.orders import stopped_robot, told
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.rules import Identity
 from bufgym_relay.store import Store
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.ledger import Stop
 from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.orders import stopped_robot, told
 from bufgym_robot.wire.tasks import Tasks
 
 

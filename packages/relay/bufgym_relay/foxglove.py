@@ -12,12 +12,13 @@ from typing import Any, Final
 from bufgym.traces.formats.bag_poses import Frames
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.libraries import needs
-from bufgym_robot.wire import ros_messages, messages as wire
 from bufgym_relay.config import Config, Foxglove, Rule
 from bufgym_relay.gate import Gate, hidden_host
-from bufgym_robot.wire.place import Place
 from bufgym_relay.recorder import SCHEMAS
 from bufgym_relay.rules import FOXGLOVE, Permissions
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire import ros_messages
+from bufgym_robot.wire.place import Place
 from bufgym_robot.wire.session import Session
 
 OWN_PAGES: Final = ("https://app.foxglove.dev", "file://")  # The web page, and programs that are pages of their own

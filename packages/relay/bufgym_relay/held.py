@@ -13,17 +13,17 @@ from contextlib import contextmanager, suppress
 from typing import Final
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
 from bufgym_relay.config import Config
 from bufgym_relay.disk import Disk
 from bufgym_relay.facts import Facts
+from bufgym_relay.rules import Identity
+from bufgym_relay.stored import Settled, StoredSession
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.orders import robot_of
 from bufgym_robot.wire.patterns import Pattern, pattern
-from bufgym_relay.rules import Identity
 from bufgym_robot.wire.unanswered import UNKNOWN
-from bufgym_relay.stored import Settled, StoredSession
-from bufgym_robot.wire.messages import RefusedError
 
 FILE: Final = "held.sqlite"
 MOST: Final = 256

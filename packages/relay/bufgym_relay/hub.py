@@ -10,10 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.audit import Audit
 from bufgym_relay.claims import Claims
-from bufgym_robot.wire.clock import ServerClock
 from bufgym_relay.config import Config
 from bufgym_relay.desk import Desk
 from bufgym_relay.disk import Disk
@@ -22,9 +20,7 @@ from bufgym_relay.held import MOST
 from bufgym_relay.last import Last
 from bufgym_relay.member import Member, OtherRelays
 from bufgym_relay.orders import Orders
-from bufgym_robot.wire.orders import heard_stops, robot_of
 from bufgym_relay.outgoing import Outgoing
-from bufgym_robot.wire.patterns import escaped, pattern
 from bufgym_relay.quota import Quotas
 from bufgym_relay.recorder import Recorder, Tape
 from bufgym_relay.roster import GONE, Roster, is_last, status_of
@@ -33,7 +29,11 @@ from bufgym_relay.store import Store
 from bufgym_relay.stored import Settled, StoredSession
 from bufgym_relay.subscriber import Subscription
 from bufgym_relay.turns import Turns
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.clock import ServerClock
 from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.orders import heard_stops, robot_of
+from bufgym_robot.wire.patterns import escaped, pattern
 from bufgym_robot.wire.tasks import Tasks
 
 if TYPE_CHECKING:

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Rule
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.rules import Permissions
 from bufgym_relay.stored import StoredSession
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 
 
 class Member(Protocol):

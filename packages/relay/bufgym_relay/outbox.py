@@ -11,12 +11,12 @@ from typing import Final
 
 from websockets.exceptions import WebSocketException
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.caller import Caller
 from bufgym_relay.member import Member
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.stored import NOT_REACHED
 from bufgym_relay.subscriber import Lane, Subscription, make_one, next_lane
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import WireError
 
 LARGE_BYTES: Final = 2**16  # Size of a message beyond which its writing takes long

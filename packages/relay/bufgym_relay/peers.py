@@ -18,20 +18,20 @@ from typing import Any, Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import policies, protocol
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.answers import Answers
-from bufgym_robot.wire.backoff import Backoff
 from bufgym_relay.bus import HOLD, MESSAGE, TOLD, TRIES, Bus, options
-from bufgym_robot.wire.clock import Delays
 from bufgym_relay.config import DEFAULT_CAPACITY, Nats, Rule
 from bufgym_relay.hub import CONNECTED, Hub
-from bufgym_robot.wire.ledger import read
-from bufgym_robot.wire.orders import STOP, heard_stops, is_stop, robot_of, stopped_robot
 from bufgym_relay.outgoing import Outgoing
-from bufgym_robot.wire.patterns import pattern
 from bufgym_relay.rules import NATS, Permissions
 from bufgym_relay.stored import StoredSession
 from bufgym_relay.subscriber import Subscription, make_one, next_lane
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.backoff import Backoff
+from bufgym_robot.wire.clock import Delays
+from bufgym_robot.wire.ledger import read
+from bufgym_robot.wire.orders import STOP, heard_stops, is_stop, robot_of, stopped_robot
+from bufgym_robot.wire.patterns import pattern
 from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 _RETRY_S: Final = 1.0

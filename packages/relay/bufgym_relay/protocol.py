@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 
 from bufgym.model.checks import whole
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import DEFAULT_CAPACITY, Config, Rule
-from bufgym_robot.wire.orders import is_stop
-from bufgym_robot.wire.patterns import pattern
 from bufgym_relay.quota import Quota
 from bufgym_relay.roster import GONE, is_last
 from bufgym_relay.rules import Identity, Permissions
 from bufgym_relay.stored import StoredSession
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import RefusedError, WireError
+from bufgym_robot.wire.orders import is_stop
+from bufgym_robot.wire.patterns import pattern
 
 if TYPE_CHECKING:
     from bufgym_relay.policies import Rule as Chosen

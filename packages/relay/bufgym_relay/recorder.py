@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from bufgym_robot.wire import ros_messages, messages as wire
 from bufgym_relay.config import Config, Rotation, Rule
 from bufgym_relay.disk import Disk
 from bufgym_relay.rules import RECORDER, Permissions
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire import ros_messages
 from bufgym_robot.wire.mcap_file import McapFile
 
 FOLDER: Final = "recordings"

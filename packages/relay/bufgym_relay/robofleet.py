@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from bufgym_relay import protocol
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import SKIP_PENDING
 from bufgym_relay.connection import Connection
@@ -22,6 +21,7 @@ from bufgym_relay.outgoing import ROBOFLEET, Outgoing
 from bufgym_relay.protocol import Admitted
 from bufgym_relay.rules import Permissions
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import WireError
 
 SUBSCRIPTION_TYPES: Final = ("amrl_msgs/RobofleetSubscription", "RobofleetSubscription")

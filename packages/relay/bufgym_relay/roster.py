@@ -12,8 +12,8 @@ from contextlib import suppress
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.store import Store
+from bufgym_robot.wire import messages as wire
 
 AWAY_S: Final = 5.0
 """Silence after which a robot is away; ``fleet.js`` has it too."""

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from bufgym_relay.config import Rule
+from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.orders import COMMAND_S, right
 from bufgym_robot.wire.patterns import pattern, topic_of
-from bufgym_robot.wire.messages import RefusedError
 
 Verb = Literal["send", "receive"]
 _REMEMBERED: Final = 4_096  # answers cached for one identity

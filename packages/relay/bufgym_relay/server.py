@@ -22,9 +22,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from bufgym.utils.errors import BufgymError
-from bufgym.utils.libraries import needs
 from bufgym_relay import connection, pages, policies, turns
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.admission import Accepted, Admission
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import POLICIES, Config
@@ -33,6 +31,7 @@ from bufgym_relay.hub import CONNECTED, STATUS, Hub
 from bufgym_relay.identity import Verifier, renew, server_context
 from bufgym_relay.robofleet import RobofleetConnection
 from bufgym_relay.rules import Identity, Permissions
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.sockets import free_port
 from bufgym_robot.wire.tasks import until_one_ends
 
@@ -225,8 +224,7 @@ class Server:
     def _metrics(self, address: str) -> Response:
         if not Permissions(self.config.rules, Identity(address)).allow("receive", STATUS):
             return pages.response(HTTPStatus.FORBIDDEN, f"no rule lets this address receive {STATUS}\n")
-        with needs("prometheus_client", "bufgym-live[relay]"):
-            from bufgym_relay import metrics  # not at start-up: few need it
+        from bufgym_relay import metrics  # not at start-up: few need it
 
         counts = metrics.text(self.hub.status(), self.hub.audit.refusals)
         return pages.response(HTTPStatus.OK, counts, metrics.CONTENT_TYPE)

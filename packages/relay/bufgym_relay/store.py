@@ -18,11 +18,11 @@ from bufgym_relay.audit import Audit
 from bufgym_relay.config import Config
 from bufgym_relay.disk import STALL_S, Disk
 from bufgym_relay.held import Held
-from bufgym_robot.wire.ledger import Stop
-from bufgym_robot.wire.patterns import Pattern
 from bufgym_relay.rules import Identity
 from bufgym_relay.stored import NOT_REACHED, Settled, StoredSession
+from bufgym_robot.wire.ledger import Stop
 from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.patterns import Pattern
 
 _POLL_S: Final = 0.005
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from bufgym_robot.wire.patterns import Pattern
-from bufgym_robot.wire.unanswered import UNKNOWN
 from bufgym_relay.rules import Identity
 from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.patterns import Pattern
+from bufgym_robot.wire.unanswered import UNKNOWN
 
 NOT_REACHED: Final = "not reached: its robot was away until the deadline"
 

@@ -17,9 +17,9 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
-from bufgym_robot.wire.patterns import Pattern
 from bufgym_relay.plain import Latest
 from bufgym_relay.policies import PLACES, Rule, new_queue
+from bufgym_robot.wire.patterns import Pattern
 
 if TYPE_CHECKING:
     from bufgym_robot.wire.queue import Item, PolicyQueue

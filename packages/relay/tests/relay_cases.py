@@ -19,9 +19,9 @@ for library in ("websockets", "re2", "jwt"):
 from websockets.asyncio.client import ClientConnection, connect  # noqa: E402
 from websockets.typing import Subprotocol  # noqa: E402
 
-from bufgym_robot.wire import messages as wire  # noqa: E402
 from bufgym_relay.config import Config, Rule  # noqa: E402
 from bufgym_relay.server import Server  # noqa: E402
+from bufgym_robot.wire import messages as wire  # noqa: E402
 from bufgym_robot.wire.messages import Message  # noqa: E402
 
 PATIENCE_S = 120.0

@@ -24,9 +24,9 @@ from restart_truth import DEADLINE_S, Truth, covers
 from ros_cuts_session import QUICK
 from ros_session import CONFIG, node_1, node_2
 
-from bufgym_robot.wire import backoff
 from bufgym_relay import claims
 from bufgym_robot.fleet.kept import place
+from bufgym_robot.wire import backoff
 from bufgym_robot.wire.ledger import read
 from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.sockets import free_port

@@ -18,8 +18,8 @@ from pose_cases import ESTIMATE, POSE, message
 from relay_cases import client, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.messages import Message
+from bufgym_robot.wire.session import Session
 
 TEXT = "std_msgs/msg/String"
 CONFIG = '[[topic]]\nname = "chatter"\nrate_hz = 20\nsize_bytes = 20\n'

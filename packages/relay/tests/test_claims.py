@@ -12,13 +12,13 @@ from relay_cases import Client, client, nothing, relay, settings, until, wait
 from test_stops import Program
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import backoff
 from bufgym_relay import claims
 from bufgym_relay.config import Limits, Rule
-from bufgym_robot.wire.patterns import exactly, pattern, topic_of
 from bufgym_robot.fleet.robot import Robot
-from bufgym_robot.wire.session import Session
+from bufgym_robot.wire import backoff
 from bufgym_robot.wire.messages import RefusedError, WireError
+from bufgym_robot.wire.patterns import exactly, pattern, topic_of
+from bufgym_robot.wire.session import Session
 
 pytestmark = compiled
 ASCII = [chr(code) for code in range(0x20, 0x7F) if chr(code) != "/"]

@@ -17,8 +17,8 @@ for library in ("websockets", "re2", "rosbags", "PIL"):
 from break_story import Done, story  # noqa: E402
 from made_up_robot import MadeUp  # noqa: E402
 
-from bufgym_robot.wire import backoff  # noqa: E402
 from bufgym_robot.fleet.robot import Robot  # noqa: E402
+from bufgym_robot.wire import backoff  # noqa: E402
 
 pytestmark = compiled
 CUTS = [6, pytest.param(100, marks=pytest.mark.nightly)]

@@ -10,10 +10,10 @@ from test_stops import Program
 from wire_cases import FAR, PORT, Wire, at, between, waited  # noqa: F401  (a fixture)
 
 from bufgym_relay.config import Rule
-from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.server import Server
-from bufgym_robot.wire.session import Session
+from bufgym_robot.fleet.robot import Robot
 from bufgym_robot.tunnel import Tunnel
+from bufgym_robot.wire.session import Session
 
 ANYBODY = Rule(address="0.0.0.0/0", send=True, receive=True)
 DEAD_S = 8.0

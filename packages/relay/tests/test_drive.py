@@ -12,10 +12,10 @@ from relay_cases import client, relay, settings, until, wait
 
 from bufgym_relay.config import Rule
 from bufgym_relay.drivers import TWIST, Drivers, check_speed
-from bufgym_robot.fleet.drive import Drive
-from bufgym_robot.wire.driving import STILL, Velocity
-from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.rules import Identity, Permissions
+from bufgym_robot.fleet.drive import Drive
+from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire.driving import STILL, Velocity
 from bufgym_robot.wire.messages import Message, RefusedError
 
 

@@ -25,14 +25,14 @@ from bufgym.model.topics import Topic
 from bufgym.traces.formats import bags
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import audit, server
-from bufgym_robot.wire import backoff
-from bufgym_robot.fleet.client import RobotClient
 from bufgym_relay.config import Rule
 from bufgym_relay.hub import Hub
 from bufgym_relay.recorder import FOLDER
-from bufgym_robot.wire.session import Session
 from bufgym_relay.store import Store
+from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.wire import backoff
 from bufgym_robot.wire.mcap_file import McapFile
+from bufgym_robot.wire.session import Session
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))
 RULES = (ALL, Rule(recorder=True, receive=True, topic="/robots/.*"))

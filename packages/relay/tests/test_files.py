@@ -23,8 +23,8 @@ from bufgym_relay.audit import FILE, Audit
 from bufgym_relay.config import Rotation, Rule
 from bufgym_relay.recorder import FOLDER, Recorder
 from bufgym_relay.replay import answer_text, piece, recordings
-from bufgym_robot.wire.messages import Message
 from bufgym_robot.wire.mcap_file import McapFile
+from bufgym_robot.wire.messages import Message
 from bufgym_robot.wire.sockets import free_port
 
 pytest.importorskip("mcap", reason=needs("extras", "mcap"))

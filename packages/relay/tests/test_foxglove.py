@@ -17,13 +17,13 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import ros_messages
 from bufgym_relay.config import Foxglove, Rule
 from bufgym_relay.foxglove import Bridge, Screen
-from bufgym_robot.fleet.robot import Robot
 from bufgym_relay.server import Server
-from bufgym_robot.wire.session import Session
+from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire import ros_messages
 from bufgym_robot.wire.messages import MAX_STAMP_US, Message
+from bufgym_robot.wire.session import Session
 
 CONFIG = settings(policies=("drop-oldest",))
 

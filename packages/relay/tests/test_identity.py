@@ -21,8 +21,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import identity
-from bufgym_robot.wire.address import token
 from bufgym_relay.config import Rule, Tls, Tokens
+from bufgym_robot.wire.address import token
 from bufgym_robot.wire.session import Session
 
 jwt = pytest.importorskip("jwt", reason=needs("extras", "jwt"))

@@ -13,14 +13,14 @@ from relay_cases import Client, client, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import admission
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Limits
-from bufgym_robot.wire.patterns import pattern
 from bufgym_relay.plain import SkipPending
 from bufgym_relay.quota import Quota, Quotas
 from bufgym_relay.rules import Identity
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import Message
+from bufgym_robot.wire.patterns import pattern
 
 LIMITS = Limits(message_bytes=10**6, incoming_bytes=2 * 10**6, messages_per_s=10**6)
 _BINARY, _MORE, _PING, _FIN, _MASKED = 0x02, 0x00, 0x89, 0x80, 0x80

@@ -12,9 +12,9 @@ from relay_cases import client, nothing, relay, settings, until, untrusted, wait
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import Nats, StoreLimits
-from bufgym_robot.wire.clock import Delays
 from bufgym_relay.hub import Hub
 from bufgym_relay.peers import Peers
+from bufgym_robot.wire.clock import Delays
 from bufgym_robot.wire.sockets import free_port
 
 pytestmark = needs_server

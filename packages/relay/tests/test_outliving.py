@@ -12,12 +12,12 @@ from loop_cases import beside, compiled
 from relay_cases import Corner, relay, settings, until, wait, within
 
 from bufgym.model.topics import Topic
-from bufgym_robot.wire import backoff, inbox
-from bufgym_robot.fleet.client import RobotClient
 from bufgym_relay.config import Limits
 from bufgym_relay.connection import Connection
-from bufgym_robot.wire.session import Session
+from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.wire import backoff, inbox
 from bufgym_robot.wire.messages import Message, RefusedError
+from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.tasks import until_one_ends
 
 

@@ -16,8 +16,8 @@ pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))
 from bufgym.traces import read_workload
 from bufgym.traces.formats.bag_poses import ODOMETRY, carries_poses
 from bufgym_robot.fleet.bag import BagSource
-from bufgym_robot.wire.place import Place
 from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire.place import Place
 from tests.traces.bag_cases import write_mcap
 
 Said = tuple[str, str, float, str]

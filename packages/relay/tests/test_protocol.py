@@ -15,17 +15,18 @@ from relay_cases import settings
 
 from bufgym.policies import registry
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import backoff, messages as wire
 from bufgym_relay import protocol
-from bufgym_robot.wire.backoff import Backoff
 from bufgym_relay.config import Config, Limits, Rule
-from bufgym_robot.wire.patterns import for_client, pattern
 from bufgym_relay.protocol import check_json
 from bufgym_relay.quota import Quota, Quotas
 from bufgym_relay.rules import Identity, Permissions
-from bufgym_robot.wire.session import Session
 from bufgym_relay.stored import StoredSession
+from bufgym_robot.wire import backoff
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.backoff import Backoff
 from bufgym_robot.wire.messages import Message, RefusedError, WireError
+from bufgym_robot.wire.patterns import for_client, pattern
+from bufgym_robot.wire.session import Session
 
 
 def test_tries_spread_out_and_begin_anew_after_a_connection_that_held() -> None:

@@ -18,14 +18,14 @@ from bufgym.model.link import Link
 from bufgym.model.topics import Topic
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
+from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.shaped import ShapedLink
 from bufgym_robot.wire import backoff
 from bufgym_robot.wire.address import parsed, security, token
-from bufgym_robot.fleet.client import RobotClient
-from bufgym_robot.wire.session import Session
-from bufgym_robot.wire.unanswered import Unanswered
 from bufgym_robot.wire.messages import Message, RefusedError
-from bufgym_robot.shaped import ShapedLink
+from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.sockets import free_port
+from bufgym_robot.wire.unanswered import Unanswered
 
 
 @pytest.fixture(autouse=True)

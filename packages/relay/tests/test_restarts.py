@@ -24,9 +24,9 @@ from test_stops import COMMAND, Program  # noqa: E402
 
 from bufgym.utils.errors import BufgymError  # noqa: E402
 from bufgym_relay import Nats, claims  # noqa: E402
-from bufgym_robot.wire import backoff  # noqa: E402
 from bufgym_relay.config import Config, Rule  # noqa: E402
 from bufgym_robot.fleet.robot import Robot  # noqa: E402
+from bufgym_robot.wire import backoff  # noqa: E402
 from bufgym_robot.wire.session import Session  # noqa: E402
 from bufgym_robot.wire.sockets import free_port  # noqa: E402
 

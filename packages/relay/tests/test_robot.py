@@ -22,10 +22,11 @@ from bufgym.model import qoi
 from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.fleet import robot
-from bufgym_robot.wire import ros_messages, messages as wire
 from bufgym_robot.fleet.bag import BagSource
 from bufgym_robot.fleet.monitor import Monitor
 from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire import ros_messages
 from bufgym_robot.wire.session import Session
 
 pytest.importorskip("rosbags", reason=needs("extras", "rosbags"))

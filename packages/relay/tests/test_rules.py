@@ -26,13 +26,13 @@ from bufgym_relay import policies
 from bufgym_relay.config import Config, Foxglove, Limits, Rotation, Rule, load
 from bufgym_relay.hub import Hub
 from bufgym_relay.outgoing import Outgoing
-from bufgym_robot.wire.patterns import MAX_CHARACTERS, pattern
 from bufgym_relay.plain import Latest
 from bufgym_relay.quota import Bucket, Quotas
 from bufgym_relay.rules import FOXGLOVE, RECORDER, Identity, Permissions, plain_address
 from bufgym_relay.stored import StoredSession
 from bufgym_relay.subscriber import Subscription, next_lane
 from bufgym_robot.wire.messages import Message, RefusedError
+from bufgym_robot.wire.patterns import MAX_CHARACTERS, pattern
 from bufgym_robot.wire.queue import PolicyQueue
 
 VERBS = ("send", "receive")

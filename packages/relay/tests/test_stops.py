@@ -13,18 +13,18 @@ from loop_cases import beside, compiled
 from relay_cases import client, relay, settings, until, wait
 
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import backoff
-from bufgym_robot.wire.clock import RelayClock
 from bufgym_relay.config import Rule
-from bufgym_robot.fleet.drive import Drive
-from bufgym_robot.wire.driving import STILL, Velocity
-from bufgym_robot.wire.ledger import Stop
 from bufgym_relay.orders import Orders
-from bufgym_robot.wire.orders import moves
+from bufgym_robot.fleet.drive import Drive
 from bufgym_robot.fleet.robot import Robot
 from bufgym_robot.fleet.ros import Ros1
-from bufgym_robot.wire.session import Session
+from bufgym_robot.wire import backoff
+from bufgym_robot.wire.clock import RelayClock
+from bufgym_robot.wire.driving import STILL, Velocity
+from bufgym_robot.wire.ledger import Stop
 from bufgym_robot.wire.messages import Message, RefusedError
+from bufgym_robot.wire.orders import moves
+from bufgym_robot.wire.session import Session
 
 COMMAND, STOP = "/robots/r/command", "/robots/r/stop"
 

@@ -14,11 +14,11 @@ from loop_cases import beside
 from relay_cases import client, relay, settings, until
 
 from bufgym_relay import caller, outbox, replay, server, turns
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.connection import Connection
 from bufgym_relay.hub import MOST_IN_TURN
 from bufgym_relay.outgoing import Outgoing
 from bufgym_relay.subscriber import Subscription
+from bufgym_robot.wire import messages as wire
 
 
 async def test_who_takes_a_long_turn_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,8 +19,8 @@ from websockets.exceptions import WebSocketException
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import identity, outbox, pages
-from bufgym_robot.wire import messages as wire
 from bufgym_relay.config import Limits, Rule
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import Message
 
 LIMITS = Limits(connections=500, sessions=10_000, topics=1_000, messages_per_s=10**6)

@@ -15,9 +15,9 @@ from relay_cases import Corner, until, within
 
 from bufgym.model.link import Link
 from bufgym.traces import Trace
+from bufgym_robot.shaped import ShapedLink
 from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import Message
-from bufgym_robot.shaped import ShapedLink
 
 REPO = Path(__file__).resolve().parents[3]
 PAGE = (REPO / "packages/relay/bufgym_relay/PROTOCOL.md").read_text(encoding="utf-8")

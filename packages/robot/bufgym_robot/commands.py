@@ -92,9 +92,9 @@ async def send(
     from bufgym.model import qoi
     from bufgym_robot import LogFile, PolicyQueue
     from bufgym_robot.channels import TRANSPORTS
-    from bufgym_robot.wire.log import Record
     from bufgym_robot.sender import Leaves, Sender
     from bufgym_robot.view import View
+    from bufgym_robot.wire.log import Record
 
     policy, (host, port) = one_policy(policies, policy_file), address(to)
     path = None if motion == "none" else traces.load_motion(motion)
@@ -170,8 +170,8 @@ async def receive(
         out: Write received messages to this file (.mcap).
         messages: Stop after so many.
     """
-    from bufgym_robot.wire.mcap_file import MAX_CHANNELS
     from bufgym_robot.receiver import Received, Receiver, Recording
+    from bufgym_robot.wire.mcap_file import MAX_CHANNELS
 
     host, port = listens_at(at, host, port)
     enough, taken = asyncio.Event(), 0

@@ -21,8 +21,8 @@ from bufgym.scenario import Episode
 from bufgym.traces import MotionSettings
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.processes import end_with
-from bufgym_robot.wire.queue import PolicyQueue
 from bufgym_robot.receiver import Received
+from bufgym_robot.wire.queue import PolicyQueue
 
 CAMERA, ODOMETRY = "/camera", "/odom"
 """The topics: ``CompressedImage``, whose ``format`` is the frame's number, and ``PoseStamped``."""

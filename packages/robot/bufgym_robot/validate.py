@@ -19,12 +19,12 @@ from bufgym.sim import run
 from bufgym.sim.metrics import outcome, received
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.channels import TRANSPORTS, Channel
-from bufgym_robot.wire.log import Record
-from bufgym_robot.wire.queue import PolicyQueue
 from bufgym_robot.receiver import Received, Receiver
 from bufgym_robot.runs import LiveRun
 from bufgym_robot.sender import Leaves, Sender
 from bufgym_robot.shaped import ShapedLink
+from bufgym_robot.wire.log import Record
+from bufgym_robot.wire.queue import PolicyQueue
 
 
 async def play(

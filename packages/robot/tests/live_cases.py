@@ -14,9 +14,9 @@ from needs import needs
 from bufgym_robot import PolicyQueue
 from bufgym_robot.channels import TRANSPORTS
 from bufgym_robot.frames import DATA, GREETING, Frame
-from bufgym_robot.wire.log import Record
 from bufgym_robot.receiver import Received, Receiver
 from bufgym_robot.sender import Sender
+from bufgym_robot.wire.log import Record
 
 LIBRARIES = {"websocket": "websockets", "zenoh": "zenoh", "mqtt": "paho.mqtt"}
 

@@ -19,8 +19,8 @@ from bufgym.model import qoi
 from bufgym.traces.formats import bags
 from bufgym_robot import LogFile
 from bufgym_robot.commands import address
-from bufgym_robot.wire.sockets import free_port, host_port
 from bufgym_robot.view import View
+from bufgym_robot.wire.sockets import free_port, host_port
 
 FAST = ["--size", "1000", "--rate", "300", "--duration", "0.1", "--capacity", "64"]
 """30 messages in 0.1 s, and room for all of them, however slow the machine is."""

@@ -21,8 +21,8 @@ from wire_cases import FAR, NEAR, PORT, Far, Wire, at, program, waited
 from bufgym_robot import PolicyQueue
 from bufgym_robot.channels import TcpChannel
 from bufgym_robot.sender import Sender
-from bufgym_robot.wire.sockets import bounded_backoff
 from bufgym_robot.tunnel import Tunnel
+from bufgym_robot.wire.sockets import bounded_backoff
 
 MOVED = "10.79.0.3"
 MASTER = 11311

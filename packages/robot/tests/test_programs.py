@@ -24,12 +24,12 @@ from bufgym.model.link import Link
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
+from bufgym_papers.figures import figure, run_live
 from bufgym_robot import programs as live
-from bufgym_robot.wire.odometry import Odometry
 from bufgym_robot.programs import pose_stamp, publish_in_time, received, running
 from bufgym_robot.ros1 import episode as ros1
 from bufgym_robot.ros2 import episode as ros2
-from bufgym_papers.figures import figure, run_live
+from bufgym_robot.wire.odometry import Odometry
 
 EPISODE = Episode(
     messages(np.array([0, 20_000, 60_000]), np.array([5, 6, 7]), np.array([0.0, 0.25, 1.5])),

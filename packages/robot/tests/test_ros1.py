@@ -22,11 +22,11 @@ from bufgym.policies import get
 from bufgym.traces import MotionSettings, motion_from_poses
 from bufgym.traces.poses import Poses, unit
 from bufgym_robot import PolicyQueue, replay, ros1
-from bufgym_robot.wire.log import of, read_log
-from bufgym_robot.wire.odometry import Odometry
 from bufgym_robot.ros1 import new_address
 from bufgym_robot.ros1.__main__ import main as command
 from bufgym_robot.ros1.connection import PolicyConnection
+from bufgym_robot.wire.log import of, read_log
+from bufgym_robot.wire.odometry import Odometry
 
 pytestmark = compiled
 

@@ -26,12 +26,12 @@ from bufgym.scenario import Stream, read_client
 from bufgym.utils.errors import BufgymError
 from bufgym_robot import PolicyQueue, replay
 from bufgym_robot.frames import FrameError
-from bufgym_robot.wire.log import of, read_log
 from bufgym_robot.ros2 import relay
 from bufgym_robot.ros2.diagnostics import Diagnostics
 from bufgym_robot.ros2.names import Published, parse
 from bufgym_robot.ros2.places import Place, left_out, places
 from bufgym_robot.ros2.relay import RosSender
+from bufgym_robot.wire.log import of, read_log
 
 REPO = Path(__file__).resolve().parents[3]
 NO_ROS = not JIT or importlib.util.find_spec("rclpy") is None

@@ -29,10 +29,10 @@ from bufgym.sim import outcome, run
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
 from bufgym_robot import PolicyQueue, far, tunnel
-from bufgym_robot.wire import sockets
 from bufgym_robot.frames import ACK, Frame
 from bufgym_robot.path_window import PathWindow
 from bufgym_robot.sender import Sender
+from bufgym_robot.wire import sockets
 
 V = qoi.exponential(0.618)
 REPO = Path(__file__).resolve().parents[3]

@@ -21,14 +21,14 @@ from bufgym_robot import PolicyQueue, replay
 from bufgym_robot.bus_channel import BusChannel
 from bufgym_robot.channels import TRANSPORTS, WebSocketChannel
 from bufgym_robot.frames import DATA, GREETING, HEADER_BYTES, Frame, Room, header
-from bufgym_robot.wire.log import Record
 from bufgym_robot.margins import margins
 from bufgym_robot.receiver import Received
 from bufgym_robot.runs import LiveRun, orders, table
 from bufgym_robot.sender import Sender
 from bufgym_robot.shaped import ShapedLink
-from bufgym_robot.wire.tasks import Tasks
 from bufgym_robot.validate import over, play, validate
+from bufgym_robot.wire.log import Record
+from bufgym_robot.wire.tasks import Tasks
 
 V = qoi.exponential(0.618)
 PERIOD_US, SIZE_BYTES = 33_333, 200_000

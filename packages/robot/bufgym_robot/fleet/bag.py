@@ -11,8 +11,8 @@ from bufgym.model.topics import Topic
 from bufgym.scenario import Stream
 from bufgym.traces.formats.bags import messages, read_bag
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import ros_messages
 from bufgym_robot.fleet.robot import Robot
+from bufgym_robot.wire import ros_messages
 
 _LATE_S = 1.0  # delay beyond which playback does not catch up but continues from the present
 

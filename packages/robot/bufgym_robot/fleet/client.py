@@ -26,9 +26,9 @@ from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.wire import messages as wire
-from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.log import Record
 from bufgym_robot.wire.queue import Item, PolicyQueue
+from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.sockets import unsent_bytes, until_writable
 
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from bufgym_robot.wire.ledger import Ledger, Stop
-from bufgym_robot.wire.orders import moves
 from bufgym_robot.wire.messages import Message
+from bufgym_robot.wire.orders import moves
 
 
 class Latch:

@@ -28,14 +28,14 @@ from bufgym.model.topics import Topic
 from bufgym.policies.registry import Policy, get
 from bufgym.scenario import Stream
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import messages as wire
 from bufgym_robot.fleet.client import RobotClient
 from bufgym_robot.fleet.drive import Drive
-from bufgym_robot.wire.driving import TOPIC, Velocity
 from bufgym_robot.fleet.kept import Kept, place
 from bufgym_robot.fleet.latch import Latch
-from bufgym_robot.wire.ledger import Stop
 from bufgym_robot.fleet.monitor import Monitor
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.driving import TOPIC, Velocity
+from bufgym_robot.wire.ledger import Stop
 from bufgym_robot.wire.orders import STOP, heard_stops
 from bufgym_robot.wire.patterns import exactly
 from bufgym_robot.wire.place import Place

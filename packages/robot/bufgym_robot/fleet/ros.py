@@ -15,13 +15,14 @@ from typing import Any, Final
 
 from bufgym.scenario import Stream
 from bufgym.utils.errors import BufgymError
-from bufgym_robot.wire import ros_messages, messages as wire
-from bufgym_robot.wire.patterns import escaped
 from bufgym_robot.fleet.robot import Robot
 from bufgym_robot.ros1 import needs_rospy
 from bufgym_robot.ros2.names import Published
 from bufgym_robot.ros2.relay import look, own_node, spinning
 from bufgym_robot.ros2.republishing import HOLD_S, readers_found
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire import ros_messages
+from bufgym_robot.wire.patterns import escaped
 from bufgym_robot.wire.tasks import until_one_ends
 
 NODE: Final = "bufgym_robot"

@@ -75,9 +75,9 @@ def install(
     from bufgym.model.buffer import MAX_CAPACITY
     from bufgym.model.checks import between
     from bufgym_robot import LogFile, PolicyQueue
-    from bufgym_robot.wire.odometry import followed
     from bufgym_robot.ros1 import new_address
     from bufgym_robot.ros1.connection import PolicyConnection
+    from bufgym_robot.wire.odometry import followed
 
     between("backoff_s", backoff_s, LEAST_BACKOFF_S, MOST_BACKOFF_S, "s")
     if value is None:

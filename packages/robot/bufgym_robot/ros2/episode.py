@@ -24,13 +24,13 @@ from bufgym.policies.registry import Policy
 from bufgym.scenario import Client, Episode, Stream
 from bufgym.traces import Trace, load_motion
 from bufgym_robot import PolicyQueue, programs
-from bufgym_robot.wire.log import Record, of
 from bufgym_robot.receiver import Received
 from bufgym_robot.ros2.names import needs_rclpy
 from bufgym_robot.ros2.relay import RosSender, receive
 from bufgym_robot.shaped import ShapedLink
 from bufgym_robot.tunnel import End, Tunnel, ends
 from bufgym_robot.validate import Play, warm
+from bufgym_robot.wire.log import Record, of
 
 _DOMAIN = 20 + os.getpid() % 40 * 2
 """Domain of the robot; the base has the next. Each process has its own, because two may run at a time."""

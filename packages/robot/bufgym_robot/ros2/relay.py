@@ -24,8 +24,6 @@ from bufgym_robot import LogFile, PolicyQueue
 from bufgym_robot.channels import TRANSPORTS
 from bufgym_robot.frames import MAX_BODY_BYTES
 from bufgym_robot.latched import Latched
-from bufgym_robot.wire.log import Record
-from bufgym_robot.wire.odometry import Odometry, followed
 from bufgym_robot.receiver import Receiver
 from bufgym_robot.ros2.diagnostics import Diagnostics, publisher
 from bufgym_robot.ros2.mismatch import of_subscription
@@ -34,6 +32,8 @@ from bufgym_robot.ros2.places import left_out, places
 from bufgym_robot.ros2.republishing import HOLD_S, Republisher
 from bufgym_robot.ros2.taking import Hearing, call_events, source_of, take_all, untaken
 from bufgym_robot.sender import Leaves, Sender
+from bufgym_robot.wire.log import Record
+from bufgym_robot.wire.odometry import Odometry, followed
 from bufgym_robot.wire.sockets import BACKOFF_S, host_port
 from bufgym_robot.wire.tasks import until_one_ends
 

@@ -8,7 +8,8 @@ from urllib.parse import SplitResult
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from bufgym_robot.wire import address, messages as wire
+from bufgym_robot.wire import address
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import PING_S, PONG_S
 
 CLOSE_S = 1.0  # Time for the relay to answer that the connection is closed

@@ -5,9 +5,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from bufgym_robot.wire.clock import ASK_S, RelayClock
+from bufgym_robot.wire.messages import Message, RefusedError
 from bufgym_robot.wire.orders import COMMAND_S, is_stop, right, robot_of
 from bufgym_robot.wire.patterns import pattern
-from bufgym_robot.wire.messages import Message, RefusedError
 
 
 class Deadlines:

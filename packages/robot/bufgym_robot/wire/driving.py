@@ -37,5 +37,3 @@ def read(message: Message) -> tuple[Velocity, float]:
         pass
     rule = f"must be JSON with the finite numbers linear and angular, and for_ms from 0 to {MOST_MS}"
     raise BufgymError(f"topic {message.topic}: {bytes(message.payload[:60])!r}: {rule}")
-
-

@@ -18,17 +18,18 @@ from collections.abc import Callable, Container, Coroutine
 from typing import Any, Final
 from urllib.parse import SplitResult
 
-from bufgym_robot.wire import address, messages as wire
+from bufgym_robot.wire import address
+from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.backoff import Backoff
 from bufgym_robot.wire.deadlines import Deadlines
 from bufgym_robot.wire.inbox import Inbox
+from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.orders import is_stop
 from bufgym_robot.wire.patterns import Pattern, pattern
 from bufgym_robot.wire.stops import Stops
+from bufgym_robot.wire.tasks import Tasks, until_one_ends
 from bufgym_robot.wire.unanswered import Unanswered
 from bufgym_robot.wire.wanted import OnMessage, Wanted
-from bufgym_robot.wire.messages import RefusedError
-from bufgym_robot.wire.tasks import Tasks, until_one_ends
 
 MOST_WHYS: Final = 64  # Refused commands of which a new connection tells
 PATIENCE_S: Final = 5.0  # Time to wait for a connection, and for the relay's welcome

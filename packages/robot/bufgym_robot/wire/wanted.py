@@ -5,9 +5,9 @@ import inspect
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple
 
+from bufgym_robot.wire.messages import Message
 from bufgym_robot.wire.patterns import Pattern
 from bufgym_robot.wire.patterns import pattern as compiled
-from bufgym_robot.wire.messages import Message
 
 OnMessage = Callable[[Message], Awaitable[str | None] | str | None]
 """A program's function; of a command it may return why it was not executed."""
