@@ -40,10 +40,12 @@ def check() -> None:
     assert info["arrived"] == info["delivered"] + info["dropped"] == 150, info
     assert main(["bench", "--policies", "learned,afr,drop-oldest", "--seconds", "5", "--seeds", "1"]) == 0
     assert main(["report", "nowhere"]) == 2
-    for command, package in {"live": "live", "ros2": "live", "relay": "live", "reproduce": "papers"}.items():
+    places = {"live": "robot", "ros2": "robot", "robot": "robot", "relay": "robot relay", "reproduce": "papers"}
+    for command, names in places.items():
         with contextlib.redirect_stderr(io.StringIO()) as errors:
             assert main([command]) == 2
-        where = f"bufgym-{package}: pip install packages/{package}, in bufgym's source tree"
+        folders = " ".join(f"packages/{name}" for name in names.split())
+        where = f"bufgym-{names.split()[-1]}: pip install {folders}, in bufgym's source tree"
         assert errors.getvalue() == f"bufgym: error: {command} comes with the package {where}\n", errors.getvalue()
     try:
         gym.make("bufgym/Mapping-v0")

@@ -35,7 +35,7 @@ from bufgym_robot import read_log, replay, tunnel
 from bufgym_robot.programs import running
 from studies.round_trips import CAPACITY, RATE_HZ, SIZE_BYTES, V, link
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "live" / "tests" / "robot"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "robot" / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import fade
 import roscpp_cases

@@ -27,7 +27,7 @@ import numpy as np
 
 REPO = Path(__file__).resolve().parent.parent
 # It shares robots with the examples, and a relay's settings and clouds with the tests.
-SHARED = ("packages/live/tests", "packages/relay/tests", "tests", "examples")
+SHARED = ("packages/robot/tests", "packages/relay/tests", "tests", "examples")
 sys.path[:0] = [str(REPO / name) for name in SHARED]
 
 import page_cases

@@ -104,7 +104,7 @@ def test_a_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.metadata, "version", importlib.metadata.distribution)
     monkeypatch.setattr(importlib.metadata.Distribution, "discover", lambda **_: iter(()))
     assert errors.install("plot") == 'pip install -e ".[plot]"'
-    assert errors.install("bufgym-robot[relay]") == 'pip install -e "packages/live[relay]"'
+    assert errors.install("bufgym-robot[relay]") == 'pip install -e "packages/robot[relay]"'
 
 
 def test_every_hint_names_an_extra_that_there_is() -> None:

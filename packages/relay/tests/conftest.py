@@ -13,7 +13,6 @@ sys.path.append(
     str(Path(__file__).resolve().parents[3] / "tests" / "fuzz")
 )  # mutations lie beside the fuzzing of files
 sys.path.append(str(Path(__file__).resolve().parents[3] / "examples"))  # the made-up robots
-sys.path.append(str(Path(__file__).resolve().parents[1] / "robot"))  # links between namespaces
 _NUMBERS = itertools.count(1)
 
 

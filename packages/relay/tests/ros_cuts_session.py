@@ -36,7 +36,7 @@ async def cuts(version: str, folder: Path, count: int, seed: int) -> dict[str, i
     publishers = {"1": node_1, "2": node_2}[version](str(folder), hear)
     pytest.MonkeyPatch().setattr(backoff, "MOST_S", 0.05)  # for as long as this process lives
     async with story(done, goal) as (url, run):
-        words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
+        words = ["robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
         words += ["--policies", "drop-oldest", "--receive", "goal_pose", "--receive", "cmd_vel"]
         robot = await asyncio.create_subprocess_exec(sys.executable, "-c", QUICK, *words, stdout=sys.stderr)
         try:

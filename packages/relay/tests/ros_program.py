@@ -11,8 +11,9 @@ import pytest
 from needs import needs
 
 HERE = Path(__file__).resolve().parent
-REPO = HERE.parents[3]
-FOLDERS = HERE, HERE.parent, HERE.parent / "robot", HERE.parents[1], REPO / "tests", REPO / "examples"
+REPO = HERE.parents[2]
+PACKAGES = REPO / "packages" / "robot", REPO / "packages" / "relay"
+FOLDERS = HERE, PACKAGES[0] / "tests", *PACKAGES, REPO / "tests", REPO / "examples"
 
 
 def run(request: pytest.FixtureRequest, name: str, version: str, *words: Any, limit_s: float = 600) -> tuple[Any, str]:

@@ -45,7 +45,7 @@ class Process:
     def __init__(self, version: str, folder: Path, truth: Truth, chance: random.Random, url: str) -> None:
         config = folder / "client.toml"
         config.write_text(CONFIG)
-        words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
+        words = ["robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
         words += ["--policies", "drop-oldest", "--receive", "goal_pose", "--receive", "cmd_vel"]
         self._words, self._file, self._truth = words, place(urlsplit(url).netloc, "r"), truth
         self._held: dict[str, float] = {}

@@ -1,6 +1,6 @@
 """A robot of ROS at a relay, for test_robot.py: prints what came each way. Needs rospy and rosmaster, or rclpy.
 
-node --/chatter, /odom--> ``bufgym relay robot`` --> relay --> viewer
+node --/chatter, /odom--> ``bufgym robot`` --> relay --> viewer
 viewer --/robots/r/to/speech, goal_pose, initialpose, cmd_vel and /robots/r/drive--> node
 viewer --/robots/r/to/unheard--> nobody
 """
@@ -119,7 +119,7 @@ async def story(version: str, folder: Path) -> dict[str, Any]:
 
     async with relay(settings(no_drop=("/robots/[^/]+/(command|to/.*)",))) as server:
         url = f"ws://127.0.0.1:{server.port}"
-        words = ["relay", "robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
+        words = ["robot", "--to", url, "--name", "r", "--config", str(config), "--ros", version]
         words += ["--odom", "odom", "--policies", "drop-oldest"]
         words += [word for topic in (*hear, "unheard") for word in ("--receive", topic)]
         robot = await asyncio.create_subprocess_exec(sys.executable, "-m", "bufgym", *words, stdout=sys.stderr)

@@ -209,7 +209,7 @@ def test_credentials_are_looked_at_before_the_start(tmp_path: Path, monkeypatch:
     credentials = tmp_path / "west.creds"
     with_them = settings(nats=Nats("nats://127.0.0.1:1", "a", str(credentials)))
     monkeypatch.setitem(sys.modules, "nkeys", None)
-    refuse(r"bufgym_live\.relay needs nkeys: pip install ", Peers, Hub(with_them), with_them.nats)
+    refuse(r"bufgym_relay needs nkeys: pip install ", Peers, Hub(with_them), with_them.nats)
     monkeypatch.setitem(sys.modules, "nkeys", object())
     refuse(r"west\.creds: no such file", Peers, Hub(with_them), with_them.nats)
     credentials.write_text("a password\n")

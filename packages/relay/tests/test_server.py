@@ -240,7 +240,7 @@ def test_the_command_names_what_is_wrong(
     words: list[str], naming: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fails(["relay", "robot", *words], naming, capsys)
+    fails(["robot", *words], naming, capsys)
 
 
 async def test_a_port_that_is_taken() -> None:

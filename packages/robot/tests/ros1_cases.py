@@ -21,7 +21,7 @@ def environment(folder: Path) -> dict[str, str]:
                 (own / package.name).symlink_to(package)
     places = [
         REPO,
-        REPO / "packages" / "live",
+        REPO / "packages" / "robot",
         own,
         *(place for place in sys.path if place.endswith("site-packages")),
         SYSTEM,

@@ -73,7 +73,7 @@ def test_an_episode_through_a_node_is_that_of_the_simulator(ros: dict[str, str],
 
 def test_without_ros_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setitem(sys.modules, "rospy", None)
-    refuse(r"bufgym_live\.robot\.ros1 needs rospy: .* python3-rospy", ros1.install, "afr")
+    refuse(r"bufgym_robot\.ros1 needs rospy: .* python3-rospy", ros1.install, "afr")
     fails([*VALIDATE[1:], "ros1"], "bufgym_robot.ros1 needs rospy", capsys)
 
 
