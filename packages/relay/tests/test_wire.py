@@ -20,7 +20,7 @@ from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.messages import Message
 
 REPO = Path(__file__).resolve().parents[3]
-PAGE = (REPO / "packages/relay/bufgym_relay/PROTOCOL.md").read_text(encoding="utf-8")
+PAGE = (REPO / "packages/robot/bufgym_robot/wire/PROTOCOL.md").read_text(encoding="utf-8")
 CLIENT = REPO / "examples/relay_client.js"
 IS_THERE = "process.exit(typeof WebSocket === 'undefined' ? 1 : 0)"
 

@@ -1,4 +1,4 @@
-// A TCP connection over a link that dies and comes back, and under a robot whose address changes (robot/sockets.py).
+// A TCP connection over a link that dies and comes back, and under a robot whose address changes (wire/sockets.py).
 #ifndef BUFGYM_ROSCPP_LINK_H
 #define BUFGYM_ROSCPP_LINK_H
 #include <cerrno>
