@@ -118,7 +118,8 @@ while waiting:
 def is_needed(distributions):
     return any(re.sub(r"[-_.]+", "-", name).lower() in needed for name in distributions)
 
-optional = {top for top, of in metadata.packages_distributions().items() if not is_needed(of)}
+tops = metadata.packages_distributions().items()
+optional = {top for top, of in tops if not is_needed(of) and not top.startswith("bufgym")}
 assert {"msgspec", "torch", "jinja2"} & optional, sorted(needed)
 
 class Hidden(importlib.abc.MetaPathFinder):
