@@ -31,9 +31,9 @@ from nats_cases import nats_server  # isort: skip  (relay_load has made it known
 from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.wire.messages import UNKNOWN
 from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.sockets import free_port
-from bufgym_robot.wire.unanswered import UNKNOWN
 
 RELAYS, RATE_HZ, SIZE_BYTES, COMMAND_S, DEADLINE_S = 3, 2.0, 20_000, 0.5, 60
 KILL_S, STALL_EVERY_S, SETTLES_S, SAMPLE_S = 10.0, 60.0, 8.0, 5.0

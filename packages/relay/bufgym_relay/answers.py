@@ -5,7 +5,7 @@ from typing import Final
 from bufgym_relay.hub import Hub
 from bufgym_relay.stored import Settled, StoredSession
 from bufgym_robot.wire import messages as wire
-from bufgym_robot.wire.unanswered import UNKNOWN
+from bufgym_robot.wire.messages import UNKNOWN
 
 _MOST_EARLY: Final = 256
 _GRACE_US: Final = 2_000_000  # time beyond a command's deadline for the answer to come

@@ -26,10 +26,8 @@ from bufgym_relay.rules import Permissions
 from bufgym_relay.stored import StoredSession, command_number
 from bufgym_relay.subscriber import Subscription
 from bufgym_robot.wire import messages as wire
-from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.orders import is_stop, order, robot_of
 from bufgym_robot.wire.patterns import pattern
-from bufgym_robot.wire.unanswered import UNKNOWN
 
 Work = Callable[[], Coroutine[Any, Any, None]]
 HELLO_BYTES: Final = 2**16  # Size limit of a frame from a client that has not yet said hello
@@ -104,7 +102,7 @@ class Connection:
             if (known := self.session.outcomes.get(seq)) is not None:
                 self._hub.tell_outcome(known)
             elif seq <= self.session.received and not await self._hub.store.waits(self.session, seq):
-                self.tell("delivered", seq=seq, receivers=1, lost=1, why=UNKNOWN)
+                self.tell("delivered", seq=seq, receivers=1, lost=1, why=wire.UNKNOWN)
 
     async def _read(self) -> None:
         """What the client says, until one of both ends it."""
@@ -186,7 +184,7 @@ class Connection:
 
     async def _busy(self, topic: str, seq: int) -> None:
         await asyncio.sleep(BUSY_S)  # so that its client does not hurry
-        self._refused(RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
+        self._refused(wire.RefusedError("busy", "too much waits for the disk"), topic, seq, no_drop=True)
 
     async def _change(self, said: Mapping[str, Any]) -> None:
         try:
@@ -230,7 +228,7 @@ class Connection:
                 hub.publish(self, message)
             elif not new or await self._hold(message):
                 self.tell("ack", seq=message.seq)
-        except RefusedError as refused:
+        except wire.RefusedError as refused:
             self._refused(refused, message.topic, message.seq, message.no_drop)
 
     @property
@@ -243,13 +241,13 @@ class Connection:
         """Confirm a stop or a release once it is on the disk; until then its client says it again."""
         try:
             await kept
-        except RefusedError as refused:
+        except wire.RefusedError as refused:
             why = f"it is in force, but lost when the relay restarts: {refused}"
-            self._refused(RefusedError(refused.code, why), message.topic, message.seq, no_drop=False)
+            self._refused(wire.RefusedError(refused.code, why), message.topic, message.seq, no_drop=False)
         else:
             self.tell("stopped", topic=message.topic, id=order(message)["id"])
 
-    def _refused(self, refused: RefusedError, topic: str, seq: int, no_drop: bool) -> None:
+    def _refused(self, refused: wire.RefusedError, topic: str, seq: int, no_drop: bool) -> None:
         refused = self.session.doubted(refused, seq if no_drop else -1)
         about = {"code": refused.code, "topic": topic, "session": self.session.name}
         first = self._hub.audit.repeated(what="publish", **about, **self._caller.identity.as_json())
@@ -325,7 +323,7 @@ async def serve(kind: type[Connection], caller: Caller, greeted: Callable[[], No
             async with asyncio.timeout(hello_s):
                 admitted = await kind.greet(caller)
         except TimeoutError:
-            raise RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
+            raise wire.RefusedError("too_slow", f"no hello within {hello_s:g} s") from None
         await hub.store.catch_up(caller.identity, admitted.session, admitted.acked, admitted.received)
         if admitted.robot:
             about = caller.identity, admitted.session, admitted.permissions

@@ -20,10 +20,9 @@ from bufgym_relay.facts import Facts
 from bufgym_relay.rules import Identity
 from bufgym_relay.stored import Settled, StoredSession
 from bufgym_robot.wire import messages as wire
-from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.messages import UNKNOWN, RefusedError
 from bufgym_robot.wire.orders import robot_of
 from bufgym_robot.wire.patterns import Pattern, pattern
-from bufgym_robot.wire.unanswered import UNKNOWN
 
 FILE: Final = "held.sqlite"
 MOST: Final = 256

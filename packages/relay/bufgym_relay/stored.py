@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from bufgym_relay.rules import Identity
-from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.messages import UNKNOWN, RefusedError
 from bufgym_robot.wire.patterns import Pattern
-from bufgym_robot.wire.unanswered import UNKNOWN
 
 NOT_REACHED: Final = "not reached: its robot was away until the deadline"
 

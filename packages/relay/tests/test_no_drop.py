@@ -23,11 +23,10 @@ from bufgym_relay.rules import Identity
 from bufgym_relay.store import Store
 from bufgym_relay.stored import Settled
 from bufgym_robot.wire import backoff
-from bufgym_robot.wire.messages import RefusedError
+from bufgym_robot.wire.messages import UNKNOWN, RefusedError
 from bufgym_robot.wire.patterns import pattern
 from bufgym_robot.wire.session import Session
 from bufgym_robot.wire.sockets import free_port
-from bufgym_robot.wire.unanswered import UNKNOWN
 
 CONFIG = settings(store=StoreLimits(window=2, messages=4))
 KILLS = int(os.environ.get("BUFGYM_KILLS", "2"))

@@ -14,11 +14,11 @@ from relay_cases import client, full_disk, nothing, relay, settings, until, wait
 from test_stops import COMMAND, RULE, Program
 
 from bufgym.utils.errors import BufgymError
-from bufgym_relay import claims
+from bufgym_relay import claims, orders
 from bufgym_relay.rules import Identity
 from bufgym_robot.fleet.kept import Kept
 from bufgym_robot.fleet.robot import Robot
-from bufgym_robot.wire import backoff, orders
+from bufgym_robot.wire import backoff
 from bufgym_robot.wire.session import Session
 
 pytestmark = compiled

@@ -19,6 +19,7 @@ from bufgym.utils.errors import BufgymError
 
 PATH: Final = "/relay"
 SUBPROTOCOL: Final = "bufgym.relay.v1"
+UNKNOWN: Final = "nobody knows whether it was executed"
 OWN: Final = "relay"  # The relay's name as a sender, and the prefix of its topics
 MAX_FRAME_BYTES: Final = 2**26
 PING_S: Final = 20.0  # Time between two pings of either end

@@ -1,6 +1,6 @@
 """A session at a relay: keeps a connection, subscribes, and sends commands that arrive exactly once.
 
-This is all that a viewer needs. ``client.RobotClient`` adds a queue for a robot's messages.
+This is all that a viewer needs. ``fleet.client.RobotClient`` adds a queue for a robot's messages.
 
 Of several relays that share topics, the first is the client's home. While it is away, the next one that answers stands
 in for it: messages and subscriptions go over that one until home is back. No_drop messages and durable subscriptions
@@ -23,7 +23,6 @@ from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.backoff import Backoff
 from bufgym_robot.wire.deadlines import Deadlines
 from bufgym_robot.wire.inbox import Inbox
-from bufgym_robot.wire.messages import RefusedError
 from bufgym_robot.wire.orders import is_stop
 from bufgym_robot.wire.patterns import Pattern, pattern
 from bufgym_robot.wire.stops import Stops
@@ -178,7 +177,7 @@ class Session:
                 except HomeIsBack:
                     self._at = 0
                     continue
-                except RefusedError as refused:
+                except wire.RefusedError as refused:
                     next_token = callable(self._token) and self.welcome and refused.code == "unauthorized"
                     if refused.code in _FOR_GOOD and not (self.stands_in or next_token):
                         raise
@@ -223,7 +222,7 @@ class Session:
         """
         size_bytes, most = len(wire.encode(message)), self.welcome.get("max_message_bytes", wire.MAX_FRAME_BYTES)
         if size_bytes > most:
-            raise RefusedError("too_large", f"topic {message.topic}: {size_bytes} bytes: must be at most {most}")
+            raise wire.RefusedError("too_large", f"topic {message.topic}: {size_bytes} bytes: must be at most {most}")
         return size_bytes
 
     def note(self, fault: str) -> None:
@@ -255,7 +254,7 @@ class Session:
         await self._say_it("hello", **hello)
         said = wire.heard(await self._connection.recv())
         if said["op"] == "refused":
-            raise RefusedError(said["code"], f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
+            raise wire.RefusedError(said["code"], f"{self.address.geturl()}: refused: {said['code']}: {said['why']}")
         if said["op"] != "welcome":
             raise wire.WireError(f"op {said['op']!r}: must be welcome")
         self.welcome = said
@@ -339,9 +338,9 @@ class Session:
             self._subscriptions.confirmed.add(said["id"])
             self._confirm()
         elif said["op"] == "refused":
-            error = RefusedError(said["code"], f"topic {said.get('topic')}: refused: {said['code']}: {said['why']}")
+            why = wire.RefusedError(said["code"], f"topic {said.get('topic')}: refused: {said['code']}: {said['why']}")
             if is_stop(str(said.get("topic"))):
-                self._stops.refuse(said.get("seq", 0), error)
+                self._stops.refuse(said.get("seq", 0), why)
             elif said["what"] == "publish" and self._unanswered.expects(said.get("topic", ""), said.get("seq")):
                 self._unanswered.refuse(said["code"], said["why"])
             elif said["what"] == "subscribe" and said["code"] not in _FOR_GOOD:

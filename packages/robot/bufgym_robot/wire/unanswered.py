@@ -11,13 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 from bufgym.utils.errors import BufgymError
 from bufgym_robot.wire import messages as wire
 from bufgym_robot.wire.orders import robot_of
 
-UNKNOWN: Final = "nobody knows whether it was executed"
 AGAIN = ("out_of_order", "busy")
 """Codes of refusals after which a message is sent again: it is behind a refused one, or the relay's disk stalls."""
 
@@ -81,7 +79,7 @@ class Unanswered:
             try:
                 self._check(message := self._dated(pending.message, pending.put_s))
             except BufgymError as error:
-                _settle(pending, BufgymError(f"{error}: {UNKNOWN}") if pending.sent else error)
+                _settle(pending, BufgymError(f"{error}: {wire.UNKNOWN}") if pending.sent else error)
             else:
                 pending.sent = True
                 self._sent.append(pending)
