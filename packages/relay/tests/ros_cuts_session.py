@@ -15,7 +15,7 @@ from ros_session import CONFIG, node_1, node_2
 
 from bufgym_robot.wire import backoff
 
-QUICK = "import sys; from bufgym_relay import backoff; backoff.MOST_S = 0.05; from bufgym.cli import main; main()"
+QUICK = "import sys; from bufgym_robot.wire import backoff; backoff.MOST_S = 0.05; from bufgym.cli import main; main()"
 """The command, which connects again soon."""
 
 
