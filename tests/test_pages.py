@@ -239,8 +239,8 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 """What a page says of its program."""
 
 ELSEWHERE = {
-    "docs/guide/ros1.md": "packages/live/tests/robot/test_ros1.py",
-    "docs/guide/ros2.md": "packages/live/tests/robot/test_ros2.py",
+    "docs/guide/ros1.md": "packages/robot/tests/test_ros1.py",
+    "docs/guide/ros2.md": "packages/robot/tests/test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
     "docs/guide/yours-to-change.md": "below",
 }
