@@ -3,4 +3,4 @@
 from bufgym.utils.errors import BufgymError
 
 __all__ = ["BufgymError", "__version__"]
-__version__ = "0.2.0"
+__version__ = "0.3.0"

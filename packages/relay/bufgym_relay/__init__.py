@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bufgym_relay.policies import compiled
     from bufgym_relay.server import Server, serve_forever
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     "Config", "Foxglove", "Limits", "Nats", "Rotation", "Rule", "Server", "StoreLimits", "Tls", "Tokens", "compiled",
     "load", "serve_forever",

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from bufgym_robot.wire.queue import Item, PolicyQueue
     from bufgym_robot.wire.session import Session
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = [
     "TRANSPORTS", "BagSource", "Item", "LogFile", "Message", "Odometry", "PolicyQueue", "Received", "Receiver",
     "Recording", "RefusedError", "Replay", "Robot", "RobotClient", "Sender", "Session", "ShapedLink", "Source",
