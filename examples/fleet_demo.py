@@ -2,7 +2,7 @@
 
     python examples/fleet_demo.py --robots 3
 
-Open the page that it names. The robots come when their queue is compiled, which the first time takes up to a minute.
+Open the page that it names. It needs packages/robot and "packages/relay[demo]".
 """
 
 from __future__ import annotations

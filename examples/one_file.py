@@ -1,8 +1,7 @@
 """A whole step in one file: one sender, one link, AFR, and the environment of one queue with ordered candidates.
 
-This is `bufgym/Uplink-v1` with its default actions and the reward `retained`, in plain Python. It leaves out byte
-limits, topics, acks and speed. A test plays 200 random episodes here and in bufgym, with the same drops, H, rewards and
-observations.
+This is `bufgym/Uplink-v1` with its default actions and the reward `retained`, without byte limits, topics, acks and
+speed. A test plays 200 random episodes here and in bufgym: the drops, H, rewards and observations are the same.
 """
 
 import itertools

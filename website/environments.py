@@ -50,15 +50,15 @@ class Version:
 
 _PAIRED = (
     Version("v1", "0.3.0", "the default reward is `paired`, H above that of always dropping the cheapest"),
-    Version("v0", "0.1.0", "first version, with the default reward `retained`"),
+    Version("v0", "0.2.0", "first version, with the default reward `retained`"),
 )
 HISTORY = {
     "bufgym/Interruption-v1": _PAIRED,
     "bufgym/Uplink-v1": _PAIRED,
     "bufgym/Suite-v1": _PAIRED,
-    "bufgym/Topics-v0": (Version("v0", "0.1.0", "first version"),),
-    FLEET: (Version("v0", "0.1.0", "first version"),),
-    "bufgym/Mapping-v0": (Version("v0", "0.3.0", "first version"),),
+    "bufgym/Topics-v0": (Version("v0", "0.2.0", "first version"),),
+    FLEET: (Version("v0", "0.2.0", "first version"),),
+    "bufgym/Mapping-v0": (Version("v0", "0.2.0", "first version"),),
 }
 """Every environment's versions, newest first."""
 
