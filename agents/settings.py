@@ -212,7 +212,7 @@ class Hindsight(Settings):
     width: Count = 64
     """Hidden units of both layers."""
     num_envs: Natural = 0
-    """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
+    """Environments side by side, a sixth of which the rule plays; 0: 128 in an environment, else 384."""
     batch_size: Natural = 0
     """Decisions of one gradient step; 0: 1024 in an environment, else 2560."""
     gradient_steps: Count = 2
@@ -239,7 +239,7 @@ class Hindsight(Settings):
     @property
     def resolved(self) -> "Hindsight":
         """The same without zeros that stand for numbers by the task."""
-        usual: dict[str, Any] = {"candidates": 2, "num_envs": 256, "batch_size": 1024}
+        usual: dict[str, Any] = {"candidates": 2, "num_envs": 128, "batch_size": 1024}
         if self.kind != "environment":
             usual = {"candidates": 3, "num_envs": 384, "batch_size": 2560}
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})
