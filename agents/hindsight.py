@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from agents.held_out import split_scenario
-from agents.hindsight_network import Student, expected
+from agents.hindsight_network import Student, expected, ranked
 from agents.hindsight_rows import Lessons, Part, TaughtRows
 from agents.learner import Learner
 from agents.mixed_env import Cell, cells
@@ -107,8 +107,12 @@ class School:
         left = max(self.left, 0.0)
         for group in self.optimizer.param_groups:
             group["lr"] = self.settings.learning_rate * max(LEAST_RATE, left)
-        costs, entropy = expected(self.student(shown), cost)
-        loss = costs.mean() - self.settings.entropy * max(0.0, 2 * left - 1) * entropy.mean()
+        outputs = self.student(shown)
+        costs, entropy = expected(outputs, cost)
+        if self.settings.kind == "environment":
+            loss = ranked(outputs, cost).mean()
+        else:
+            loss = costs.mean() - self.settings.entropy * max(0.0, 2 * left - 1) * entropy.mean()
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)

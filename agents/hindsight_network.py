@@ -52,3 +52,16 @@ def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
     log_p = torch.log_softmax(outputs.masked_fill(~offered, NEVER), dim=1)
     p = log_p.exp()
     return (p * cost.masked_fill(~offered, 0)).sum(dim=1), -(p * log_p).sum(dim=1)
+
+
+def ranked(outputs: Tensor, cost: Tensor) -> Tensor:
+    """Each state's sum over pairs of actions of (cost(a) - cost(b)) log(1 + exp(output(a) - output(b))), a the dearer.
+
+    Where it is least, output(b) > output(a) if and only if b costs less on average: the difference is the logarithm of
+    what b saves over what it loses. Its gradient never vanishes while the order is wrong, as that of a softmax does.
+    """
+    offered = torch.isfinite(cost)
+    known = cost.masked_fill(~offered, 0)
+    more = (known[:, :, None] - known[:, None, :]).clamp(min=0)
+    more = more * (offered[:, :, None] & offered[:, None, :])
+    return (more * torch.nn.functional.softplus(outputs[:, :, None] - outputs[:, None, :])).sum(dim=(1, 2))
