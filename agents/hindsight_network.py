@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
 
@@ -55,13 +56,15 @@ def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def ranked(outputs: Tensor, cost: Tensor) -> Tensor:
-    """Each state's sum over pairs of actions of (cost(a) - cost(b)) log(1 + exp(output(a) - output(b))), a the dearer.
+    """Each state's sum over pairs of offered actions, a dearer than b, of
 
-    Where it is least, output(b) > output(a) if and only if b costs less on average: the difference is the logarithm of
-    what b saves over what it loses. Its gradient never vanishes while the order is wrong, as that of a softmax does.
+        (cost(a) - cost(b)) log(1 + exp(output(a) - output(b))).
+
+    For a pair it is least where output(b) - output(a) is the logarithm of what b saves over what b loses: above 0 if b
+    costs less on average. Its gradient does not vanish while an order is wrong, as that of ``expected`` does.
     """
     offered = torch.isfinite(cost)
+    pairs = offered[:, :, None] & offered[:, None, :]
     known = cost.masked_fill(~offered, 0)
-    more = (known[:, :, None] - known[:, None, :]).clamp(min=0)
-    more = more * (offered[:, :, None] & offered[:, None, :])
-    return (more * torch.nn.functional.softplus(outputs[:, :, None] - outputs[:, None, :])).sum(dim=(1, 2))
+    more = (known[:, :, None] - known[:, None, :]).clamp(min=0) * pairs
+    return (more * functional.softplus(outputs[:, :, None] - outputs[:, None, :])).sum(dim=(1, 2))

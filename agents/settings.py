@@ -220,7 +220,8 @@ class Hindsight(Settings):
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to a twentieth."""
     entropy: Least0 = 0.3
-    """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
+    """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time. In an environment there
+    is none."""
     room: Count = 400_000
     """Decisions kept to learn from; they take about 60 MB."""
     checkpoint_every: Count = 100_000
