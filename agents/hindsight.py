@@ -14,7 +14,7 @@ where it sees no harm in bad habits, as the clairvoyant could still mend everyth
 - It learns once it has seen states of many episodes. Its rows are at different moments of theirs.
 - A softmax that has given an action up learns no more of it. On families and suites a bonus for entropy, which falls to
   0 by half time, keeps it from that. On one task the bonus went to the rule's action and another that decides the same,
-  and the head was given up at once, as dropping it costs forty times action 0 on average. So there the student learns
+  and the head was never taken, as dropping it costs forty times action 0 on average. So there the student learns
   the order of its actions, by pairs (``ranked``), which needs no bonus.
 - The running mean of its weights plays, and is what validation judges.
 """
