@@ -89,7 +89,7 @@ class Task(NamedTuple):
     @property
     def settings(self) -> dict[str, Any]:
         """Settings of the environment for training."""
-        return {"capacity": CAPACITY, "info": "none", "reward": self.reward}
+        return {"capacity": CAPACITY, "info": "mask", "reward": self.reward}
 
     def make(self) -> gym.Env[Any, Any]:
         """One environment."""

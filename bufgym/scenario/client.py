@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +110,6 @@ class Client:
     value: Value = field(default_factory=lambda: qoi.exponential(0.618))
     """V of topics that have none of their own."""
 
-    reward_scale: ClassVar[float] = 0.0005
     """Factor on rewards that brings a default episode's return between 1 and 10."""
 
     def __post_init__(self) -> None:
