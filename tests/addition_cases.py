@@ -127,7 +127,7 @@ class MemoryBus:
 
 
 BUSES: Final[dict[str, Open]] = {"memory": MemoryBus, '''
-LIVE, PAPERS = "packages/live/bufgym_live", "packages/papers/bufgym_papers"
+ROBOT, PAPERS = "packages/robot/bufgym_robot", "packages/papers/bufgym_papers"
 ROWS = {
     "a policy": Addition(
         {},
@@ -223,10 +223,10 @@ ROWS = {
     "a transport": Addition(
         {},
         {
-            f"{LIVE}/robot/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
-            f"{LIVE}/robot/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
+            f"{ROBOT}/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
+            f"{ROBOT}/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
         },
-        "from bufgym_live.robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
+        "from bufgym_robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
         "async def all_come():\n"
         "    came = []\n"
         "    receiver = Receiver(came.append)\n"
@@ -263,5 +263,5 @@ def copied(folder: Path, rows: Iterable[str], forgotten: Collection[str] = ()) -
 
 def surroundings(folder: Path) -> dict[str, str]:
     """The environment of a process that imports the copy in a folder, as plain Python."""
-    places = os.pathsep.join(str(folder / name) for name in (".", "packages/live", "packages/papers"))
+    places = os.pathsep.join(str(folder / name) for name in (".", "packages/robot", "packages/papers"))
     return {**os.environ, "PYTHONPATH": places, "BUFGYM_KERNELS": "python", "MPLBACKEND": "agg"}

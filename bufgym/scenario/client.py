@@ -258,7 +258,7 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
 
     A topic's ``value`` has the form of the command line (``"exponential:0.618"``). Its sizes in other encodings look
     like ``encodings = {json = 28000}``. ``parameters`` add settings that the file lacks, such as ``traces`` and
-    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions, as in ``bufgym topics --config``.
+    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions.
 
     Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
     """

@@ -283,6 +283,18 @@ def test_regret_is_the_same_alone_and_in_a_batch() -> None:
         assert both[4]["reward_terms"]["regret"][1] == alone[4]["reward_terms"]["regret"] == alone[1]
 
 
+@kernels
+def test_where_no_message_has_room_nothing_is_given_up() -> None:
+    """B is a byte short of a message, so nothing is sent whatever one does: V* is 0 from the start."""
+    env = SenderEnv(SHORT, 3, reward="regret", max_bytes=SHORT.size_bytes - 1, decide_at="arrival")
+    env.reset(seed=0)
+    ended, rewards = False, []
+    while not ended:
+        _, reward, ended, *_ = env.step(0)
+        rewards.append(reward)
+    assert not any(rewards)
+
+
 def test_an_episode_without_a_decision_gives_up_nothing() -> None:
     episode = Episode(messages(np.arange(4) * 1_000_000, 10), Link(Trace.steps([(100.0, 1000.0)])))
     env = SenderEnv(Interruption(t_max=20), 3, reward="regret")

@@ -25,7 +25,7 @@ def played(envs: Any, rule: str = "afr") -> list[Any]:
 def test_a_weight_is_a_factor_on_the_reward_and_on_nothing_else() -> None:
     """As ``docs/guide/environments.md`` has it for returns of a size that a learner likes."""
     for id, factor in (("bufgym/Uplink-v0", 0.1), ("bufgym/Topics-v0", 0.0005)):
-        plain = played(gym.make_vec(id, 2, **SMALL[id]))
+        plain = played(gym.make_vec(id, 2, reward="retained", **SMALL[id]))
         scaled = played(gym.make_vec(id, 2, reward={"retained": factor}, **SMALL[id]))
         for (before, terms), (rewards, same_terms) in zip(plain, scaled, strict=True):
             np.testing.assert_allclose(rewards, factor * before, rtol=1e-12)

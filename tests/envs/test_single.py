@@ -39,7 +39,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 
 
 def make(scenario: str = "fading", **options: Any) -> SenderEnv:
-    return SenderEnv(SCENARIOS[scenario], 4, **options, actions="slots")
+    return SenderEnv(SCENARIOS[scenario], 4, **{"reward": "retained", **options}, actions="slots")
 
 
 def begun(**options: Any) -> SenderEnv:
@@ -83,7 +83,7 @@ def test_rewards_worked_by_hand() -> None:
     """
     v1, v2 = 1 - 0.618, 1 - 0.618**2
     for slot in (0, 1):
-        env = SenderEnv(Interruption(law="fixed", t_max=4), 2, actions="slots")
+        env = SenderEnv(Interruption(law="fixed", t_max=4), 2, reward="retained", actions="slots")
         env.reset(seed=0)
         rewarded = []
         for action in (3, 3, slot, 2):
@@ -148,7 +148,7 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
 
 @kernels
 def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None:
-    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow", actions="slots")
+    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow", reward="retained", actions="slots")
     observation, info = env.reset(seed=0)
     assert info["action_mask"].tolist() == [False] * 8 + [True, False]
     assert not any(array.any() for array in observation.values())

@@ -248,7 +248,7 @@ def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None
 
 
 def test_gymnasiums_wrappers_understand_the_infos() -> None:
-    envs: Any = DictInfoToList(RecordEpisodeStatistics(FlattenObservation(vector("interruption"))))
+    envs: Any = DictInfoToList(RecordEpisodeStatistics(FlattenObservation(vector("interruption", reward="retained"))))
     envs.reset(seed=0)
     finished = 0
     for _ in range(60):

@@ -22,11 +22,11 @@ lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
 WORK = """bufgym.benchmark.run.run bufgym.benchmark.sweep.run_sweep bufgym.benchmark.leaderboard.make
-bufgym.benchmark.leaderboard.validate bufgym_live.robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
-bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_live.robot.commands.send
-bufgym_live.robot.commands.receive bufgym_live.robot.commands.link bufgym_live.robot.ros2.commands.send
-bufgym_live.robot.ros2.commands.receive bufgym_live.relay.commands.serve bufgym_live.relay.commands.robot
-bufgym_live.relay.commands.foxglove bufgym_live.robot.cost.cost bufgym_live.robot.validate.validate
+bufgym.benchmark.leaderboard.validate bufgym_robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
+bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_robot.commands.send
+bufgym_robot.commands.receive bufgym_robot.commands.link bufgym_robot.ros2.commands.send
+bufgym_robot.ros2.commands.receive bufgym_relay.commands.serve bufgym_relay.commands.robot
+bufgym_relay.commands.foxglove bufgym_robot.cost.cost bufgym_robot.validate.validate
 bufgym.envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 
