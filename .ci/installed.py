@@ -36,7 +36,7 @@ def check() -> None:
     import bufgym
     from bufgym.cli import main
 
-    env = gym.make("bufgym/Uplink-v0", capacity=4, duration_s=5.0)
+    env = gym.make("bufgym/Uplink-v1", capacity=4, duration_s=5.0)
     _, info = env.reset(seed=0)
     ended = False
     while not ended:

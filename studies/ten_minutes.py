@@ -2,7 +2,7 @@
 
 python -m studies.ten_minutes --library tianshou --minutes 10 --out runs/ten_minutes.csv
 
-Each library has its own PPO, with its defaults or the numbers of its first example, on ``Uplink-v0`` with L = 8. Only
+Each library has its own PPO, with its defaults or the numbers of its first example, on ``Uplink-v1`` with L = 8. Only
 Tianshou has its DQN. Actions are the environment's default, ordered candidates, and all of them are valid. So no
 library needs a mask. The reward is ``regret`` unless ``--reward`` names another. The minutes are processor time of the
 process and all those below it, so other work on the machine does not matter. Imports and the score itself do not count.
@@ -34,7 +34,7 @@ from bufgym.utils.errors import unknown
 from studies.page import command
 from studies.sb3_defaults import Episodes, append
 
-ENV, CAPACITY = "bufgym/Uplink-v0", 8
+ENV, CAPACITY = "bufgym/Uplink-v1", 8
 LINE = ("library", "reward", "minutes", "score")
 
 

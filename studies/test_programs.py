@@ -18,7 +18,7 @@ SHORT = {
     "studies.relay_others": "--robots 2 --viewers 1 --seconds 1",
     "studies.relay_return": "--clients 2 --kills 1 --away 1",
     "studies.relay_soak": "--robots 3 --viewers 3 --minutes 0.05",
-    "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms hindsight",
+    "studies.hyperparameters": "--env bufgym/Uplink-v1 --seconds 1 --algorithms hindsight",
 }
 """Program and verb -> the options that make it short."""
 NEEDED = {

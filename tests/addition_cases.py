@@ -148,7 +148,7 @@ ROWS = {
             "bufgym/model/observe/on_board.py": ("ON_BOARD_FIELDS = (\n", f"ON_BOARD_FIELDS = ({FIELD}"),
             "docs/guide/yours-to-change.md": ("- `rate_trend`\n", "- `rate_trend`\n- `half_full`\n"),
         },
-        "env = gym.make('bufgym/Uplink-v0', actions='slots', fields=['half_full', 'occupancy'], capacity=3)\n"
+        "env = gym.make('bufgym/Uplink-v1', actions='slots', fields=['half_full', 'occupancy'], capacity=3)\n"
         "env.reset(seed=0)\n"
         "for _ in range(40):\n"
         "    seen = env.step(3)[0]\n"
@@ -159,7 +159,7 @@ ROWS = {
     "a reward term": Addition(
         {},
         {"bufgym/model/observe/terms.py": ('\n\n@built_in("energy"', f'\n{TERM}\n\n@built_in("energy"')},
-        "env = gym.make('bufgym/Uplink-v0', reward={'starved': 1.0}); env.reset(seed=0)\n"
+        "env = gym.make('bufgym/Uplink-v1', reward={'starved': 1.0}); env.reset(seed=0)\n"
         "assert env.step(0)[1] in (-1.0, 0.0)",
     ),
     "a scenario": Addition(
@@ -198,7 +198,7 @@ ROWS = {
                 "        self.sloth = options.sloth\n        self._beside =",
             ),
         },
-        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.sub_envs.sloth == 3",
+        "assert gym.make('bufgym/Uplink-v1', sloth=3).unwrapped.sub_envs.sloth == 3",
     ),
     "a trace format": Addition(
         {},

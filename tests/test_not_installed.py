@@ -88,7 +88,7 @@ for make in (gym.make, gym.make_vec):
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=True)
     listed, *fault = done.stdout.splitlines()
-    assert "bufgym/Uplink-v0" in listed and "bufgym/Mapping-v0" not in listed
+    assert "bufgym/Uplink-v1" in listed and "bufgym/Mapping-v0" not in listed
     command = f"pip install -e {REPO / 'packages' / 'papers'}"
     assert fault == [f"bufgym/Mapping-v0 comes with the package bufgym-papers: {command}"] * 2
 
@@ -96,7 +96,7 @@ for make in (gym.make, gym.make_vec):
 def test_a_stand_in_takes_any_argument() -> None:
     with pytest.raises(BufgymError, match="there"):
         packages.raise_absent("there", num_envs=3, render_mode="human")
-    assert "fault" not in gym.spec("bufgym/Uplink-v0").kwargs
+    assert "fault" not in gym.spec("bufgym/Uplink-v1").kwargs
 
 
 WITHOUT_EXTRAS = """

@@ -220,7 +220,7 @@ def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, capsys:
 BEFORE = {
     "docs/guide/experts.md": """
         import gymnasium as gym
-        env = gym.make("bufgym:bufgym/Interruption-v0", capacity=2, t_max=6)
+        env = gym.make("bufgym:bufgym/Interruption-v1", capacity=2, t_max=6)
         env.reset(seed=0)""",
     "docs/guide/real-sockets.md": """
         import types

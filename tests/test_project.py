@@ -66,7 +66,7 @@ NEEDED_LATER = (
     "sqlite3", "ssl", "tqdm",
 )  # fmt: skip
 """What a first step does without, of Python and of libraries."""
-MADE = "'bufgym/Uplink-v0', capacity=8"
+MADE = "'bufgym/Uplink-v1', capacity=8"
 FIRST = {
     "import": "",
     "step": f"e = gymnasium.make({MADE}); e.reset(seed=0); e.step(0)",

@@ -68,7 +68,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     of the scenario (``t_max=100``), as an object or as the text of the command line (``value="saturating:0.5"``).
 
     ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and ``{"trace": t, "seed": s}`` the
-    episode behind that row of ``bufgym bench``. On ``bufgym/Suite-v0`` add the row's ``scenario``; ``trace`` may be
+    episode behind that row of ``bufgym bench``. On ``bufgym/Suite-v1`` add the row's ``scenario``; ``trace`` may be
     left out, as the seed tells it. ``reset(seed=s)`` begins a different sequence of episodes.
 
     Raises ``BufgymError`` for an unfit argument, option or action, and ``ResetNeeded`` for a step before a reset or

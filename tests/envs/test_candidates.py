@@ -172,13 +172,13 @@ def test_actions_do_what_the_slot_actions_do() -> None:
 
 
 def test_the_defaults_of_each_kind_of_environment() -> None:
-    env = gym.make("bufgym/Uplink-v0")
+    env = gym.make("bufgym/Uplink-v1")
     assert (env.action_space, env.observation_space.shape) == (gym.spaces.Discrete(3), (27,))
     assert env.unwrapped.sub_envs.senders.decide_at == "overflow"
-    slots = gym.make("bufgym/Uplink-v0", actions="slots")
+    slots = gym.make("bufgym/Uplink-v1", actions="slots")
     assert (slots.action_space, slots.unwrapped.sub_envs.senders.decide_at) == (gym.spaces.Discrete(10), "arrival")
     assert gym.make("bufgym/Topics-v0").action_space == gym.spaces.Discrete(34)
-    named = gym.make("bufgym/Uplink-v0", candidates=3, decide_at="arrival", observation="dict")
+    named = gym.make("bufgym/Uplink-v1", candidates=3, decide_at="arrival", observation="dict")
     assert named.action_space == gym.spaces.Discrete(5) and named.observation_space["candidate_merged"].shape == (4,)
 
 
@@ -306,7 +306,7 @@ def test_an_episode_without_a_decision_gives_up_nothing() -> None:
 @kernels
 @pytest.mark.parametrize("actions", ["candidates", "slots"])
 @pytest.mark.parametrize(
-    ("name", "more"), [("Uplink-v0", {}), ("Interruption-v0", {}), ("Suite-v0", {"suite": "generated-v1"})]
+    ("name", "more"), [("Uplink-v1", {}), ("Interruption-v1", {}), ("Suite-v1", {"suite": "generated-v1"})]
 )
 def test_rewards_and_the_bound_have_one_clairvoyant(name: str, more: dict[str, Any], actions: str) -> None:
     """Default environments: ``regret`` sums to H less the H that ``bound`` names, the first step's loss included."""

@@ -193,6 +193,19 @@ def test_the_default_reward() -> None:
         assert np.array_equal(reward, info["reward_terms"]["retained"]) and "paired" not in info["reward_terms"]
 
 
+@pytest.mark.parametrize("name", ["Uplink", "Interruption", "Suite"])
+def test_the_version_before_differs_in_its_reward_alone(name: str) -> None:
+    with pytest.warns(DeprecationWarning, match="upgrading to version `v1`"):
+        before = gym.make(f"bufgym/{name}-v0")
+    now = gym.make(f"bufgym/{name}-v1")
+    assert np.array_equal(before.reset(seed=3)[0], now.reset(seed=3)[0])
+    for action in (0, 1, 2, 1):
+        seen, reward, ended, _, info = before.step(action)
+        assert np.array_equal(seen, now.step(action)[0]) and reward == info["reward_terms"]["retained"]
+        if ended:
+            break
+
+
 PLAIN = policies.Policy("plain-python", lambda buffer, arrival, memory: policies.ACCEPT)
 test_wrong_use = refused(
     (lambda: SenderEnv("lte", reward="paired", reference="afrr"), "unknown policy 'afrr'"),

@@ -18,7 +18,7 @@ sys.path.insert(0, str(REPO))
 
 WORDS = """0 1 2 -1 1e9 1e-9 nan inf 1,2 1,1 none x afr afr,drop-oldest decimate:every=2 decimate:every=0 afr:x=1
 lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 saturating:3 nowhere nowhere.csv
-/dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v0 -- -o"""
+/dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v1 -- -o"""
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
 WORK = """bufgym.benchmark.run.run bufgym.benchmark.sweep.run_sweep bufgym.benchmark.leaderboard.make
