@@ -205,8 +205,9 @@ def _slot_fields(topics: bool) -> str:
 
 
 def _fields(fields: Iterable[Field]) -> str:
-    rows = [(f"`{f.name}`", f.per, f.group, f.unit, code(f.meaning)) for f in fields]
-    return table(("field", "per", "takes", "unit", "meaning"), rows)
+    """On a phone the first two columns fit, so the meaning is the second."""
+    rows = [(f"`{f.name}`", code(f.meaning), f.per, f.group, f.unit) for f in fields]
+    return table(("field", "meaning", "per", "takes", "unit"), rows)
 
 
 def _returns(id: str) -> str:
