@@ -3,8 +3,9 @@
 python -m studies.budget --library tianshou --reward regret --minutes 1 2 5 10 --lines runs/ten_minutes.csv
 
 The minutes are processor time of the process and all those below it, so other work on the machine does not matter.
-Imports, preparations and evaluations do not count. At each of the minutes training stops where it is, the score is
-appended to the file, and training goes on; at the last it is cut. The score is computed as in ``studies.sb3_defaults``,
+Imports, preparations and evaluations do not count. At the first step of an environment after each of the minutes, the
+score is appended to the file, and training goes on; after the last it is cut. So an update is never cut in two, and
+``cpu_s`` in the file has the time that it was. The score is computed as in ``studies.sb3_defaults``,
 which needs the extras ``train`` and ``plot`` beside the library and psutil.
 """
 
@@ -15,12 +16,13 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"  # before any library is imported
 
 import contextlib
+import math
 import random
-import signal
+import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 
 import numpy as np
 import psutil
@@ -32,6 +34,8 @@ from studies.page import command
 from studies.sb3_defaults import Episodes, append
 
 MINUTES = (1.0, 2.0, 5.0, 10.0)
+CHECK_S = 0.2
+"""Processor time between two checks, s."""
 LINE = ("library", "version", "reward", "seed", "minutes", "cpu_s", "score", "why")
 """Columns of the file: a score, or why there is none."""
 
@@ -50,31 +54,30 @@ class Budget:
 
     def __init__(self, minutes: Sequence[float], look: Callable[[float, float], None]) -> None:
         self._due, self._look = list(minutes), look
-        self._began_s = 0.0
+        self._began_s, self._next_s = 0.0, math.inf
 
     def __enter__(self) -> None:
-        self._began_s = _processor_s()
-        signal.signal(signal.SIGPROF, self._check)
-        self._watch()
+        self._began_s, self._next_s = _processor_s(), 0.0
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> bool:
-        signal.setitimer(signal.ITIMER_PROF, 0)
+        self._next_s = math.inf
         if kind is None and self._due:
             self._look(self._due[-1], _processor_s() - self._began_s)  # trained by a schedule, to its end
         return kind is TimeIsUp
 
-    def _watch(self) -> None:
-        signal.setitimer(signal.ITIMER_PROF, 0.5, 0.5)  # again and again: a destructor swallows what is raised in it
-
-    def _check(self, number: int, frame: FrameType | None) -> None:
+    def check(self) -> None:
+        """Look if it is time: for each step of an environment, where a library's own state is whole."""
+        if time.process_time() < self._next_s:
+            return
         spent_s = _processor_s() - self._began_s
-        if self._due and spent_s >= 60 * self._due[0]:
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            self._look(self._due.pop(0), spent_s)
+        if spent_s >= 60 * self._due[0]:
+            reached = [m for m in self._due if spent_s >= 60 * m]  # two, if an update took long
+            self._due = self._due[len(reached) :]
+            self._look(reached[-1], spent_s)
             self._began_s = _processor_s() - spent_s
-            self._watch()
         if not self._due:
             raise TimeIsUp
+        self._next_s = time.process_time() + CHECK_S
 
 
 def _processor_s() -> float:
@@ -104,7 +107,6 @@ def page(
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     chosen, fixed = LIBRARIES[library], Episodes(episodes)
-    learner = chosen.learner(Task(reward, seed, minutes[-1]))
 
     def look(due: float, cpu_s: float) -> None:
         score = fixed.of_model(learner.policy())
@@ -113,7 +115,9 @@ def page(
         append(lines, LINE, (*start, f"{due:g}", f"{cpu_s:.1f}", f"{score:.4f}", ""))
 
     lines.parent.mkdir(exist_ok=True)
-    with Budget(minutes, look):
+    budget = Budget(minutes, look)
+    learner = chosen.learner(Task(reward, seed, minutes[-1], budget.check))
+    with budget:
         learner.train()
 
 

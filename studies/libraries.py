@@ -60,10 +60,13 @@ class Remembering:
 
 
 class Task:
-    """What a library learns: the environment with this reward, from this seed, for so many minutes of processor."""
+    """What a library learns: the environment with this reward, from this seed, for so many minutes of processor.
 
-    def __init__(self, reward: str, seed: int, minutes: float) -> None:
-        self.seed, self.minutes = seed, minutes
+    ``check`` is called before each step of each environment.
+    """
+
+    def __init__(self, reward: str, seed: int, minutes: float, check: Callable[[], None]) -> None:
+        self.seed, self.minutes, self._check = seed, minutes, check
         self.settings = {"capacity": CAPACITY, "info": "none", "reward": reward, "repeat": HELD.get(reward, 1)}
         self._made = 0
 
@@ -79,10 +82,21 @@ class Task:
         """Decisions that fit into the minutes, for a schedule that needs to know, where ``steps`` took so long."""
         return max(steps, int(60 * self.minutes / cpu_s * steps))
 
+    def watched(self, env: Any) -> Any:
+        """The environment, with the check."""
+        step = env.step
+
+        def checked(actions: Any) -> Any:
+            self._check()
+            return step(actions)
+
+        env.step = checked
+        return env
+
     def _seeded(self, env: Any) -> Any:
         env.reset(seed=1_000 * self.seed + self._made)
         self._made += 1
-        return env
+        return self.watched(env)
 
 
 def tensor(numbers: Any) -> torch.Tensor:
@@ -112,13 +126,15 @@ def stable_baselines3(package: str, name: str) -> Callable[[Task], Learner]:
         network = "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
 
         def new() -> Any:
-            return trainer(network, make_vec_env(ENV, **task.settings | {"info": "mask"}), seed=task.seed, device="cpu")
+            envs = task.watched(make_vec_env(ENV, **task.settings | {"info": "mask"}))
+            return trainer(network, envs, seed=task.seed, device="cpu")
 
         steps = 10**9
         if name == "DQN":
+            new().learn(1_000)  # what is slower at first
             began_s = time.process_time()
-            new().learn(2_000)
-            steps = task.fitting(2_000, time.process_time() - began_s)
+            new().learn(4_000)
+            steps = task.fitting(4_000, time.process_time() - began_s)
         model = new()
         return Learner(lambda: model.learn(steps), lambda: Remembering(model) if name == "RecurrentPPO" else model)
 
@@ -155,7 +171,7 @@ def sbx(task: Task) -> Learner:
 
     from bufgym.sb3 import make_vec_env
 
-    model = PPO("MlpPolicy", make_vec_env(ENV, **task.settings), seed=task.seed)
+    model = PPO("MlpPolicy", task.watched(make_vec_env(ENV, **task.settings)), seed=task.seed)
     return Learner(lambda: model.learn(10**9), lambda: Trained(lambda seen: model.predict(seen, deterministic=True)[0]))
 
 
