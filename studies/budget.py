@@ -103,7 +103,7 @@ def page(
     if not minutes or list(minutes) != sorted({m for m in minutes if m > 0}):
         raise BufgymError(f"minutes = {list(minutes)}: must be positive and ascend")
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002  (what libraries draw from)
+    np.random.seed(seed)  # some libraries draw from it
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     chosen, fixed = LIBRARIES[library], Episodes(episodes)

@@ -67,7 +67,12 @@ class Task:
 
     def __init__(self, reward: str, seed: int, minutes: float, check: Callable[[], None]) -> None:
         self.seed, self.minutes, self._check = seed, minutes, check
-        self.settings = {"capacity": CAPACITY, "info": "none", "reward": reward, "repeat": HELD.get(reward, 1)}
+        self.settings: dict[str, Any] = {
+            "capacity": CAPACITY,
+            "info": "none",
+            "reward": reward,
+            "repeat": HELD.get(reward, 1),
+        }
         self._made = 0
 
     def make(self) -> gym.Env[Any, Any]:

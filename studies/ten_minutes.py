@@ -92,7 +92,17 @@ def python_of(library: Library, environments: Path) -> str:
     if not ready.exists():
         print(f"{library.package}: making {folder}", flush=True)
         venv.create(folder, clear=True, with_pip=True)
-        install = [python, "-m", "pip", "install", "--quiet", ".[train,plot]", "psutil", *words(library.package)]
+        install = [
+            python,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-compile",
+            ".[train,plot]",
+            "psutil",
+            *words(library.package),
+        ]
         # Kernels come from the checkout and its cache.
         where = os.environ | {"BUFGYM_NO_KERNELS": "1"}
         done = subprocess.run(install, cwd=REPO, env=where, capture_output=True, text=True, check=False)
@@ -148,7 +158,7 @@ def rows(lines: Path, minutes: Sequence[float]) -> list[list[str]]:
         if len(last) > 1:
             drawn = times_drawn(len(last), RESAMPLES, stream(SEED, name + reward)) @ np.array(last) / len(last)
             cells[-1] = written(interval(drawn, len(last), within=(-math.inf, 1)), ".2f")
-        made.append((float(np.mean(last)) if last else -math.inf, [*label, str(len(last)), *cells]))
+        made.append((float(np.mean(last)) if last else -math.inf, [*label, str(max(map(len, after.values()))), *cells]))
     return [row for _, row in sorted(made, key=lambda pair: -pair[0])]
 
 
