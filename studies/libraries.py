@@ -77,11 +77,14 @@ class Task:
 
     def make(self) -> gym.Env[Any, Any]:
         """One environment, which goes on from a seed of its own at each reset."""
-        return self._seeded(gym.make(ENV, **self.settings))
+        env: gym.Env[Any, Any] = self._seeded(gym.make(ENV, **self.settings))
+        return env
 
     def make_batch(self, n: int, **settings: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
         """n rows of the native batch, likewise."""
-        return self._seeded(gym.make_vec(ENV, n, **self.settings, **settings))
+        envs = gym.make_vec(ENV, n, **self.settings, **settings)
+        seeded: gym.vector.VectorEnv[Any, Any, Any] = self._seeded(envs)
+        return seeded
 
     def fitting(self, steps: int, cpu_s: float) -> int:
         """Decisions that fit into the minutes, for a schedule that needs to know, where ``steps`` took so long."""
