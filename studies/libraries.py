@@ -257,9 +257,11 @@ def tianshou(task: Task) -> Learner:
 
 def rllib(task: Task) -> Learner:
     """The defaults of its PPO."""
+    import ray
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.tune.registry import register_env
 
+    ray.init(num_cpus=1, include_dashboard=False)  # fewer processes; it trains in this one
     register_env("uplink", lambda _: task.make())
     config = PPOConfig().environment("uplink").env_runners(num_env_runners=0).debugging(seed=task.seed)
     algorithm = config.build_algo()
