@@ -46,7 +46,7 @@ class DecisionLearner(Learner[Decisions]):
         """The batch of environments to train on: asked at a full buffer, where every action is valid."""
         settings = self.settings
         objective = self.objective(folder, seed)
-        return objective.env(settings.num_envs, settings.reward, candidates=settings.candidates, info="none")
+        return objective.env(settings.num_envs, settings.reward, candidates=settings.candidates, info="mask")
 
     def train_seed(self, folder: Path, seed: int, line: int = 0) -> Run:
         """Train one seed for its steps or so many seconds, from its latest checkpoint if any."""

@@ -151,7 +151,7 @@ class ValidationSets:
         with FileLock(home / ".lock"):  # all seeds come here at once, and a sweep's folder refuses a second process
             self._sets = [
                 EvaluationSet(sweep_for(settings, suite, "validation"), home / suite, progress=progress)
-                for suite in settings.suites.suite
+                for suite in settings.suites.names
             ]
 
     def play(self, agent: Policy) -> Verdict:
@@ -163,7 +163,7 @@ class ValidationSets:
 def test_rows(settings: Settings, policies: Sequence[Policy]) -> list[Row]:
     """The rows of these policies on the test split of the run's one suite, of any kind."""
     chosen = settings.suites
-    (suite,) = chosen.suite
+    (suite,) = chosen.names
     sweep = Sweep(suite, (), "test", chosen.capacities_of(suite), chosen.test_seeds or None)
     rows = []
     for shard in sweep.checked().shards():

@@ -154,7 +154,7 @@ class HindsightLearner(Learner[Hindsight]):
         if self.settings.kind == "environment":
             return [Part("", Cell("", split_scenario(on)[0], on.capacity), n)]
         found = {name: FAMILIES[name]("train", chosen.data) for name in self.settings.sets.named(chosen.data)}
-        found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.suite}
+        found |= {s: cells(s, "train", chosen.capacities_of(s), chosen.data) for s in chosen.names}
         parts = []
         for family, own in found.items():
             knowing = [each for cell in own for each in told(cell)]

@@ -64,7 +64,7 @@ class TaughtRows:
         self.groups, self._players, self._teachers = [], [], list[Hindsight]()
         for part in parts:
             options = Options(
-                capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="none"
+                capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="mask"
             )
             sub_envs = SubEnvs(part.rows, part.cell.scenario, options)
             self.groups.append(sub_envs)

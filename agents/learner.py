@@ -56,7 +56,7 @@ class Learner(ABC, Generic[S]):
 
     def notes(self, seed: int, name: str) -> dict[str, Any]:
         """Notes on its making, for the file of weights of a policy of this name."""
-        suite = ",".join(self.settings.suites.suite)
+        suite = ",".join(self.settings.suites.names)
         return {"name": name, "suite": suite, "seeds": [seed], "algo": self.settings.algo}
 
 

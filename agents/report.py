@@ -119,7 +119,10 @@ NEXT = (
     "  bufgym export {model} mine.safetensors --name mine",
 )
 """What to do with a model."""
-NEXT_OF_FLEET = ("  bufgym fleet --policies {model},learned,afr   # compare it in other cells", NEXT[-1])
+NEXT_OF_FLEET = (
+    "  bufgym bench --suite fleet-v1 --policies {model},learned,afr   # compare it in other cells",
+    NEXT[-1],
+)
 
 Report = tuple[list[int], dict[str, Any], str]
 """The seeds and scores for the notes of the kept agent, and what the folder holds."""
@@ -254,7 +257,7 @@ def table(
 
 def report_suites(trained: Trained) -> Report:
     """Score all agents on each suite, in a folder for each if there are several."""
-    names, contents = trained.settings.suites.suite, "model, rows, figure and numbers"
+    names, contents = trained.settings.suites.names, "model, rows, figure and numbers"
     if len(names) == 1:
         return [trained.best.seed], report_suite(trained, names[0], trained.folder)[0], contents
     notes: dict[str, Any] = {}

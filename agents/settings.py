@@ -1,15 +1,16 @@
 """The settings of training runs, which are the options of ``train.py``: a class for each algorithm.
 
-The types hold the limits of single options, which are read from text once, and each class the rules of its own.
+The types hold the limits of single options, which are read from text once, and each class the rules of its own. What
+few change (``NO_OPTION``) is set in Python alone, as in ``PPO(n_steps=128)``.
 """
 
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 from cyclopts import Parameter
 
-from agents.tasks import Environment, Families, Kind, Names, Place, Suites
-from bufgym.cli.options import Count, Least0, Natural, Positive, checked, command_line
+from agents.tasks import NO_OPTION, Environment, Families, Kind, Names, Place, Suites
+from bufgym.cli.options import Count, Natural, Positive, checked, command_line
 from bufgym.policies.weights import MAX_WIDTH
 from bufgym.utils.errors import BufgymError
 
@@ -20,6 +21,18 @@ VALIDATIONS = 300
 Seed = Annotated[int, checked(int, lambda number: 0 <= number < 2**31, "a whole number >= 0 and < 2^31")]
 Batch = Annotated[int, checked(int, lambda number: number >= 2, "a whole number >= 2")]
 Share = Annotated[float, checked(float, lambda number: 0 <= number <= 1, "a number from 0 to 1")]
+
+
+def options_of(settings: Any) -> dict[str, Any]:
+    """Option -> value, also of the settings within these."""
+    found: dict[str, Any] = {}
+    kinds = get_type_hints(type(settings), include_extras=True)
+    for name, value in vars(settings).items():
+        if is_dataclass(value):
+            found |= options_of(value)
+        elif NO_OPTION not in getattr(kinds[name], "__metadata__", ()):
+            found[name] = value
+    return found
 
 
 @dataclass(frozen=True)
@@ -58,9 +71,9 @@ class RunSettings:
 
     @property
     def command(self) -> str:
-        """The command that trains it again, with all settings that differ from the defaults."""
-        usual, beside = type(self)().values, ("name", "resume", "rule")  # type: ignore[call-arg]
-        changed = {name: v for name, v in self.values.items() if name not in beside and v != usual[name]}
+        """The command that trains it again, with all options that differ from the defaults."""
+        usual, beside = type(self)().values, ("name", "resume")  # type: ignore[call-arg]
+        changed = {name: v for name, v in options_of(self).items() if name not in beside and v != usual[name]}
         return command_line(f"python train.py {self.verb}", **changed)
 
 
@@ -108,7 +121,7 @@ class Tune(RunSettings):
     """Search a rule's named numbers by CMA-ES over whole episodes; the result is its name with its settings."""
 
     algo = "tune"
-    rule: Annotated[str, Parameter(parse=False)] = ""
+    rule: Annotated[str, NO_OPTION] = ""
     """The policy, as in bench."""
     parameters: Names = ()
     """Search these alone, as in pace,discount (default: all)."""
@@ -134,7 +147,7 @@ class SingleDecisions(Settings):
     reward: Literal["regret", "paired", "cost", "retained"] = "regret"
     """regret knows the future, which only the reward does; it needs messages of equal size, and no fleet. paired is for
     any sizes, and no fleet either."""
-    candidates: Count = 2
+    candidates: Annotated[int, NO_OPTION] = 2
     """k: how many of the cheapest candidates the agent chooses among, beside the head."""
     width: Count = 64
     """Hidden units of both layers."""
@@ -144,7 +157,7 @@ class SingleDecisions(Settings):
     """Decisions of one gradient step."""
     learning_rate: Positive = 3e-4
     gamma: Share = 0.99
-    checkpoint_every: Count = 50_000
+    checkpoint_every: Annotated[int, NO_OPTION] = 50_000
     """Steps."""
 
     def __post_init__(self) -> None:
@@ -164,12 +177,12 @@ class PPO(SingleDecisions):
 
     algo = "ppo"
     learner = "agents.ppo:CandidatePPO"
-    n_steps: Count = 256
+    n_steps: Annotated[int, NO_OPTION] = 256
     """Steps in each environment between updates: with 8, as many decisions an update as the library has with one."""
-    epochs: Count = 10
+    epochs: Annotated[int, NO_OPTION] = 10
     """Passes over the decisions of an update."""
-    gae_lambda: Share = 0.95
-    entropy: Least0 = 0.0
+    gae_lambda: Annotated[float, NO_OPTION] = 0.95
+    entropy: Annotated[float, NO_OPTION] = 0.0
     """Weight of the entropy bonus."""
 
 
@@ -184,15 +197,15 @@ class DQN(SingleDecisions):
     batch_size: Batch = 32
     """Decisions of one gradient step."""
     learning_rate: Positive = 1e-4
-    train_freq: Count = 4
+    train_freq: Annotated[int, NO_OPTION] = 4
     """Steps in each environment between updates."""
-    gradient_steps: Count = 1
+    gradient_steps: Annotated[int, NO_OPTION] = 1
     """Gradient steps of an update."""
-    buffer_size: Count = 200_000
+    buffer_size: Annotated[int, NO_OPTION] = 200_000
     """Decisions in the replay, all of a run's; they take 45 MB."""
-    learning_starts: Count = 100
+    learning_starts: Annotated[int, NO_OPTION] = 100
     """Decisions before the first update."""
-    target_update_interval: Count = 10_000
+    target_update_interval: Annotated[int, NO_OPTION] = 10_000
     """Decisions between two copies of the network to the target network."""
 
 
@@ -206,7 +219,7 @@ class Hindsight(Settings):
     steps: Natural = 300_000
     """Decisions to learn from, for each seed."""
     sets: Annotated[Families, FLAT] = Families()
-    candidates: Natural = 0
+    candidates: Annotated[int, NO_OPTION] = 0
     """k: how many of the cheapest candidates the agent chooses among, beside the head and accepting; 0: 2 in an
     environment, else 3."""
     width: Count = 64
@@ -215,15 +228,15 @@ class Hindsight(Settings):
     """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
     batch_size: Natural = 0
     """Decisions of one gradient step; 0: 1024 in an environment, else 2560."""
-    gradient_steps: Count = 2
+    gradient_steps: Annotated[int, NO_OPTION] = 2
     """Gradient steps after each decision of all environments."""
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to a twentieth."""
-    entropy: Least0 = 0.3
+    entropy: Annotated[float, NO_OPTION] = 0.3
     """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
-    room: Count = 400_000
+    room: Annotated[int, NO_OPTION] = 400_000
     """Decisions kept to learn from; they take about 60 MB."""
-    checkpoint_every: Count = 100_000
+    checkpoint_every: Annotated[int, NO_OPTION] = 100_000
     """Steps."""
 
     def __post_init__(self) -> None:

@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
-from bufgym.cli.options import Capacities, Count, Positive, checked
+from cyclopts import Parameter
+
+from bufgym.benchmark.own_suite import suite_named
+from bufgym.cli.options import Capacities, Count, checked
 from bufgym.scenario import Uplink, suites
 from bufgym.scenario.uplink import RGBD_BYTES
 from bufgym.utils.errors import BufgymError, unknown
@@ -12,8 +15,11 @@ Kind = Literal["environment", "queue", "families", "topics", "fleet"]
 """The task of a run: one environment, suites of one queue, families of links, a suite of many topics, or of robots."""
 
 _KINDS: dict[str, Kind] = {"topics": "topics", "fleet": "fleet"}
-TestSeeds = Annotated[int, checked(int, lambda number: 0 <= number <= 1000, "a whole number from 0 to 1000")]
 Names = Annotated[tuple[str, ...], checked(lambda text: tuple(text.split(",")), all, "names such as lte-v1,outage-v1")]
+
+
+NO_OPTION = Parameter(parse=False)
+"""A setting in Python that is no option of ``train.py``."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +31,10 @@ class Environment:
     """Gymnasium id."""
     capacity: Count = 8
     """L, messages."""
-    size_bytes: Count = RGBD_BYTES
+    size_bytes: Annotated[int, NO_OPTION] = RGBD_BYTES
     """Mean message size (uplink only)."""
-    duration_s: Positive = Uplink.duration_s
-    """Length of an episode (uplink only)."""
+    duration_s: Annotated[float, NO_OPTION] = Uplink.duration_s
+    """Length of an episode, s (uplink only)."""
     episodes: Count = 200
     """Held-out episodes in the evaluation."""
 
@@ -44,28 +50,31 @@ class Suites:
     suite: Names = ()
     """Train on this suite's train split instead (all its scenarios and capacities at once), keep what is best on its
     validation split, and report on its test split. Several, as in a,b: on all of them at once. A suite of a fleet
-    (fleet-v1) makes an agent that all its robots share."""
+    (fleet-v1) makes an agent that all its robots share. module:NAME is your own bufgym.suite(...); its code is run."""
     data: str | None = None
     """Folder of recordings, for suites that need one, and for the family uplinks."""
-    capacities: Capacities = ()
-    """L of a suite's episodes, such as 5,10,25; by default the suite's own."""
-    test_seeds: TestSeeds = 0
+    capacities: Annotated[tuple[int, ...], NO_OPTION] = ()
+    """L of a suite's episodes; by default the suite's own."""
+    test_seeds: Annotated[int, NO_OPTION] = 0
     """Test episodes on each trace of a suite; 0: as many as the suite says."""
 
     def __post_init__(self) -> None:
-        if not self.suite and (self.capacities or self.test_seeds):
-            raise BufgymError("--capacities and --test-seeds are of a suite, which --suite names")
-        if len(self.suite) > 1 and {"topics", "fleet"} & {suites.get(name).kind for name in self.suite}:
+        if len(self.suite) > 1 and {"topics", "fleet"} & {suites.get(name).kind for name in self.names}:
             raise BufgymError(
                 f"suite {','.join(self.suite)}: an agent for topics or a fleet learns from one suite alone"
             )
-        for name in self.suite:
+        for name in self.names:
             suites.get(name).settings("validation", self.data)  # raises here if recordings are missing
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The suites by name, one's own after its module was imported, in each process."""
+        return tuple(map(suites.named, self.suite))
 
     @property
     def kind(self) -> Kind:
         """The task of its suites."""
-        return _KINDS.get(suites.get(self.suite[0]).kind, "queue")
+        return _KINDS.get(suites.get(self.names[0]).kind, "queue")
 
     def capacities_of(self, suite: str) -> tuple[int, ...]:
         """L to train for and to test at: the given ones, or the suite's."""
@@ -102,7 +111,8 @@ class Place:
     """What a rule is tuned on."""
 
     on: str = ""
-    """A scenario or a suite (default: lte): a name (bufgym list), as in lte:rate_hz=5, or a client's .toml."""
+    """A scenario or a suite (default: lte): a name (bufgym list), as in lte:rate_hz=5, a client's .toml, or
+    module:NAME."""
     workload: str | None = None
     """A recording of a robot's messages in place of a scenario, as in bench."""
     trace: Names = ()
@@ -115,7 +125,7 @@ class Place:
     def __post_init__(self) -> None:
         if not self.on and self.workload is None:
             object.__setattr__(self, "on", "lte")
-        is_suite = self.on in suites.SUITES
+        is_suite = bool(suite_named(self.on))
         if is_suite and (self.workload is not None or self.trace):
             raise BufgymError(f"suite {self.on}: has streams and links of its own, so no --workload and no --trace")
         if self.data is not None and (not is_suite or self.workload is not None):

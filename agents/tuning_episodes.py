@@ -17,6 +17,7 @@ from agents.tasks import Place
 from agents.topics import AMPLE, ClientEpisodes, varied
 from bufgym import scenario as scenarios
 from bufgym.benchmark import tasks
+from bufgym.benchmark.own_suite import suite_named
 from bufgym.cli.scenarios import StreamOptions, WorkloadOptions, recorded
 from bufgym.policies import Policy
 from bufgym.scenario import suites
@@ -76,13 +77,13 @@ class Task:
     @staticmethod
     def of(place: Place, rule: Policy) -> Task:
         """The task of these options."""
-        if place.on in suites.SUITES:
-            suite = suites.get(place.on)
+        if name := suite_named(place.on):
+            suite = suites.get(name)
             splits = {
                 split: [setting.scenario for setting in suite.settings(split, place.data).values()]
                 for split in ("train", "validation")
             }
-            return Task(place.on, suite.kind, splits, place.capacity or suite.capacities, rule)
+            return Task(name, suite.kind, splits, place.capacity or suite.capacities, rule)
         if place.workload is not None:
             stream = StreamOptions(trace=list(place.trace) or None)
             found = recorded([place.workload], stream, WorkloadOptions(workload=[place.workload]), None).scenario

@@ -49,7 +49,7 @@ def _environments() -> None:
     slots: dict[str, Any] = {"actions": "slots"}
     ordered: tuple[dict[str, Any], ...] = ({}, {"bound": True}, {"reward": "cost"}, {"reward": "paired"})
     for name, short in _SHORT.items():
-        for options in (*ordered, slots, {**slots, "fields": _FIELDS}, {**slots, "fields": "compact"}):
+        for options in (*ordered, slots, {**slots, "fields": _FIELDS}):
             if name == "topics" and options in ordered:
                 continue
             batch = SenderVectorEnv(2, name, _L, **short, **options)

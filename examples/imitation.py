@@ -79,7 +79,7 @@ class Pupil:
             capacity=settings.capacity,
             traces=TRAIN,
             duration_s=settings.duration_s,
-            info="none",
+            info="mask",
             autoreset_mode=gym.vector.AutoresetMode.SAME_STEP,
             actions="slots",
         )

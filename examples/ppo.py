@@ -101,7 +101,7 @@ def make(
         traces=traces,
         duration_s=settings.duration_s,
         reward=reward,
-        info="none",
+        info="mask",
         autoreset_mode=mode,
     )
 

@@ -69,7 +69,7 @@ class Task:
         self.seed, self.minutes, self._check = seed, minutes, check
         self.settings: dict[str, Any] = {
             "capacity": CAPACITY,
-            "info": "none",
+            "info": "mask",
             "reward": reward,
             "repeat": HELD.get(reward, 1),
         }
@@ -134,7 +134,7 @@ def stable_baselines3(package: str, name: str) -> Callable[[Task], Learner]:
         network = "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
 
         def new() -> Any:
-            envs = task.watched(make_vec_env(ENV, **task.settings | {"info": "mask"}))
+            envs = task.watched(make_vec_env(ENV, **task.settings))
             return trainer(network, envs, seed=task.seed, device="cpu")
 
         steps = 10**9

@@ -175,7 +175,6 @@ def _batches(meter: _Meter) -> Iterator[Measurement]:
 
     yield from (figure(id, n) for id in (*ENVIRONMENTS, TOPICS) for n in sizes.batches)
     largest = max(sizes.batches)
-    yield figure(ENVIRONMENTS[0], largest, ' with fields="compact"', fields="compact", actions="slots")
     yield figure(ENVIRONMENTS[0], largest, " of slots with four named fields", fields=NAMED, actions="slots")
     yield figure(ENVIRONMENTS[0], largest, " with four named fields", fields=NAMED)
     yield figure(ENVIRONMENTS[0], max(sizes.batches), " on 2 threads", time.perf_counter, num_threads=2)
@@ -228,7 +227,7 @@ def _rolled(
 def _labels(meter: _Meter) -> Measurement:
     """Decisions of the rule gap-price, each with the regrets of all actions, as imitation needs them."""
     n, steps = LABELLED, meter.sizes.single_steps // 20
-    envs = SenderVectorEnv(n, capacity=8, autoreset_mode="SameStep", info="none", actions="slots")
+    envs = SenderVectorEnv(n, capacity=8, autoreset_mode="SameStep", info="mask", actions="slots")
     rule, clairvoyant = expert.policy(envs, "gap-price"), expert.clairvoyant(envs)
 
     def label() -> None:

@@ -194,8 +194,8 @@ ROWS = {
         {
             "bufgym/envs/options.py": ("    bound: bool", "    sloth: int = 0\n    bound: bool"),
             "bufgym/envs/sub_envs.py": (
-                "        self._own_fields =",
-                "        self.sloth = options.sloth\n        self._own_fields =",
+                "        self._beside =",
+                "        self.sloth = options.sloth\n        self._beside =",
             ),
         },
         "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.sub_envs.sloth == 3",

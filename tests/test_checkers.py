@@ -24,17 +24,11 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 """Arguments that make episodes of every environment short."""
 ROBOTS = {"capacity": 4, "duration_s": 2.0, "size_bytes": 600_000}  # an episode of a fleet has 60 ticks
-FORMS = [
-    {"observation": form, "mask_in_observation": mask, "mask_dtype": dtype}
-    for form in ("dict", "flat", "slots")
-    for mask, dtype in ((False, "int8"), (True, "int8"), (True, "bool"), ("pettingzoo", "int8"))
-]
+FORMS = [{"observation": form} for form in ("dict", "flat")]
 IDS = sorted(environments())
 
 every_id = pytest.mark.parametrize("id", IDS)
 every_form = pytest.mark.parametrize("form", FORMS, ids=str)
-# PettingZoo's tests sample by the mask that they observe, which Gymnasium wants int8.
-every_int8_form = pytest.mark.parametrize("form", [form for form in FORMS if form["mask_dtype"] == "int8"], ids=str)
 
 
 @pytest.fixture(autouse=True)
@@ -63,9 +57,6 @@ def test_gymnasium_and_a_pickled_copy_is_equal(id: str, form: dict[str, Any]) ->
     assert env_checker.data_equivalence(env.reset(seed=1), copied.reset(seed=1))
 
 
-# That library has no network for two dimensions or nested dicts; all else it checks.
-@pytest.mark.filterwarnings("ignore:Your observation .*slots.* has an unconventional shape:UserWarning")
-@pytest.mark.filterwarnings("ignore:Nested observation spaces are not supported:UserWarning")
 @every_id
 @every_form
 def test_stable_baselines3(id: str, form: dict[str, Any]) -> None:
@@ -85,7 +76,7 @@ def test_torchrl(id: str, form: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("robots", [1, 3])
-@every_int8_form
+@every_form
 def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     zoo = pytest.importorskip("pettingzoo.test", reason=needs("extras", "pettingzoo.test"))
     make = partial(bufgym.envs.FleetEnv, robots=robots, **ROBOTS, **form)
@@ -96,7 +87,7 @@ def test_pettingzoo(robots: int, form: dict[str, Any], capsys: pytest.CaptureFix
 
 # Remarks that are no rules: on observations that are dicts, and on zeros, which a robot sees at the end.
 @pytest.mark.filterwarnings("ignore:Observation")
-@every_int8_form
+@every_form
 def test_pettingzoo_turn_by_turn(form: dict[str, Any]) -> None:
     zoo = pytest.importorskip("pettingzoo.test", reason=needs("extras", "pettingzoo.test"))
     from pettingzoo.utils import parallel_to_aec

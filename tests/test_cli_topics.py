@@ -1,4 +1,4 @@
-"""``bufgym topics``, ``bench --workload`` and ``trace from-bag`` as a user types them; every number worked by hand."""
+"""``bench`` of a client and of a recording, and ``trace from-bag``, as a user types them; numbers worked by hand."""
 
 import sys
 from pathlib import Path
@@ -37,8 +37,8 @@ def config(tmp_path: Path) -> str:
 
 def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "rows.csv"
-    words = "--scale .01 --trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --window 3 --by-topic edf"
-    text = shown(["topics", "--config", config, *words.split(), "--out", out], capsys)
+    words = "--trace lte-synthetic-0 --seeds 2 --policies fifo,edf --capacity 2,4 --by-topic edf"
+    text = shown(["bench", "--scenario", f"{config}:scale=.01,window=3", *words.split(), "--out", out], capsys)
     assert "lte-synthetic-0 x 0.01, L = 2\n" in text and "edf, topic by topic" in text and "\ncommands " in text
     rows = read_rows(out, ROWS)
     assert len(rows) == 24
@@ -47,29 +47,24 @@ def test_a_client_of_ones_own(config: str, tmp_path: Path, capsys: Capsys) -> No
     assert {row["capacity"] for row in rows} == {2, 4} and {row["window"] for row in rows} == {3}
 
 
-def test_bench_is_the_one_door(config: str, tmp_path: Path, capsys: Capsys, monkeypatch: Patch) -> None:
-    """``bench`` runs a client or a fleet as it runs one queue; the client's numbers are those of ``topics``."""
-    words = ["--config", config, "--trace", "lte-synthetic-0", "--seeds", "1", "--policies", "edf", "--window", "2"]
-    for command in ("topics", "bench"):
-        shown([command, *words, "--out", tmp_path / command], capsys)
-    written = [(tmp_path / command / "table.md").read_bytes() for command in ("topics", "bench")]
-    assert written[0] == written[1] and b"edf" in written[0]
+def test_a_fleet_of_ones_own(tmp_path: Path, capsys: Capsys, monkeypatch: Patch) -> None:
+    """A function that makes a cell; its parameters stand behind its name."""
     monkeypatch.chdir(tmp_path)
     Path("cell_of_two.py").write_text(
         "from bufgym.scenario import FleetScenario\n"
         "make = lambda: FleetScenario.of(2, traces='lte-synthetic-0', duration_s=2.0)\n"
     )
     policies = ["--policies", "random", "--seeds", "1", "--capacity", "2"]
-    shown(["bench", "--scenario", "cell_of_two:make", "--robots", "3", *policies, "--out", "rows.csv"], capsys)
+    shown(["bench", "--scenario", "cell_of_two:make:robots=3", *policies, "--out", "rows.csv"], capsys)
     rows = read_rows("rows.csv", FLEET_ROWS)
     assert [(row["policy"], row["robot"]) for row in rows] == [(p, i) for p in ("random", "afr") for i in range(3)]
 
 
 @pytest.mark.nightly
-def test_the_suite_runs_by_default(capsys: Capsys) -> None:
-    words = "topics --split validation --seeds 1 --policies robofleet --consumers 2"
-    text = shown(words.split(), capsys)
-    assert "18 episodes of 60 s; n_T = 1 and 5, " in text and "Not the suite as it is: consumers = 2." in text
+def test_a_suite_of_topics(capsys: Capsys) -> None:
+    words = "--suite topics-v1 --split validation --seeds 1 --policies robofleet"
+    text = shown(["bench", *words.split()], capsys)
+    assert "18 episodes of 60 s; n_T = 1 and 5, " in text
     lines = [line.split() for line in text.splitlines() if line.startswith("robofleet ")]
     assert len(lines) == 7 and all(line[2:5] == ["1.000", "[1.000,", "1.000]"] and line[5] == "0" for line in lines)
 
@@ -79,19 +74,20 @@ def test_impossible_decisions_are_told(config: str, tmp_path: Path, capsys: Caps
     mine = tmp_path / "mine.py"
     mine.write_text(FAR_OFF.format(True))
     chosen = ["--seeds", "1", "--policies", "far-off", "--policy-file", mine]
-    printed = shown(["topics", "--config", config, "--trace", "lte-synthetic-0", *chosen], capsys)
+    printed = shown(["bench", "--scenario", config, "--trace", "lte-synthetic-0", *chosen], capsys)
     assert printed.count("invalid") == 1 and "\nnote: far-off gave 24 invalid decisions\n" in printed
     # Nor do the intervals of a single episode look as if they were known.
     assert "1 episode of 2 s" in printed and "1.000 [–]" in printed and "1.000 [1.000" not in printed
 
 
 def test_a_mistake_typed_is_not_the_files_fault(config: str, capsys: Capsys, monkeypatch: Patch) -> None:
-    fails(["topics", "--config", config, "--trace", "lte-synthetic-0", "--window", 0], "error: window = 0", capsys)
-    fails(["topics", "--config", config, "--trace", "none.csv"], "none.csv", capsys)
+    bench = ["bench", "--scenario"]
+    fails([*bench, f"{config}:window=0", "--trace", "lte-synthetic-0"], "error: window = 0", capsys)
+    fails([*bench, config, "--trace", "none.csv"], "none.csv", capsys)
     Path(config).write_text(f"window = 0\n{CONFIG}")
-    fails(["topics", "--config", config], "mine.toml: window = 0: n_T must be a whole number", capsys)
+    fails([*bench, config], "mine.toml: window = 0: n_T must be a whole number", capsys)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    fails(["topics", "--out", "rows.parquet"], "a Parquet file, unlike .csv, needs pyarrow", capsys)
+    fails([*bench, "topics", "--out", "rows.parquet"], "a Parquet file, unlike .csv, needs pyarrow", capsys)
 
 
 # A message a second; nothing crosses for 4 s, then 10 kB/s.
@@ -144,11 +140,10 @@ def test_bench_of_a_recording(here: Path, capsys: Capsys) -> None:
         (f"{W} --topics /lidar", "no topic '/lidar'; it has: /camera, /odom"),
         (f"{W} --odom /odom", "odom = '/odom': needs a recording, which this is not"),
         (f"{W} --bridge-gaps", "--bridge-gaps needs --odom"),
-        (f"{W} --interruption", "cannot go with --interruption"),
+        (f"{W} --scenario interruption", "--workload cannot go with interruption, which plays no recording"),
         (f"{W} --motion drive-0", "workload 'w' has an x of its own"),
         ("--drops d.csv", "--drops needs --workload"),
-        ("--fov-deg 70", "--fov-deg needs --motion, or --workload with --odom"),
-        ("--motion drive-0 --fov-deg 70", "--fov-deg cannot go with drive-0, which holds finished coordinates"),
+        ("--topics /camera", "--topics needs --workload"),
     ],
 )
 def test_what_does_not_go_together(here: Path, capsys: Capsys, words: str, says: str) -> None:

@@ -76,7 +76,7 @@ def test_ppo_shares_weights_over_robots_and_its_agent_needs_no_torch(capsys: Cap
     agent, noted = weights.read(folder / "model.safetensors")
     assert isinstance(agent, CandidateWeights) and agent.candidates == 2 and noted["algo"] == "ppo"
     shown(["export", folder / "model.safetensors", "mine.safetensors", "--name", "mine"], capsys)
-    words = "fleet --suite fleet-v1 --policies mine.safetensors,afr --capacity 3 --seeds 1 --jobs 1 --out played"
+    words = "bench --suite fleet-v1 --policies mine.safetensors,afr --capacity 3 --seeds 1 --jobs 1 --out played"
     shown(words.split(), capsys)
     played = [row["qoi"] for row in folder_of.read(Path("played")).rows if row["policy"] == "mine"]
     of_run = [row["qoi"] for row in rows if row["policy"] == "agent (seed 0)" and row["capacity"] == 3]

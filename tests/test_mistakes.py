@@ -40,9 +40,10 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
         ("bench --capacity 4 4", "--capacity 4,4: must be whole numbers >= 1, no two alike"),
         ("bench --bytes 1.5", "1.5: must be a whole number of bytes >= 1, as in 230000, 1e6 or 4.6MB"),
         ("bench --bytes 4.6Mbit", "4.6Mbit: must be a whole number of bytes >= 1"),
-        ("trace generate steady --rate 20Mbit --out x.csv", "20Mbit: must be bytes/s > 0, or as in 20Mbit/s"),
+        ("trace generate ramp --start 20Mbit --out x.csv", "20Mbit: must be bytes/s > 0, or as in 20Mbit/s"),
         (" ".join([*QUICK, "--bytes 4.6MB --max-bytes 1150000"]), "no message fits, the smallest has 4600000 bytes"),
         ("benc", 'Did you mean "bench"?'),
+        ("trace convert lte-synthetic-0 --out x.csv --time t", "--time and --rate go together"),
         ("trace inf", 'Did you mean "info"?'),
         ("trace info missing.csv", "missing.csv"),
         ("trace plot lte-synthetic-0 --out x.doc", "x.doc"),
@@ -53,22 +54,23 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
         ("bench --policies afr --against no-such", "no-such"),
         ("bench --capacity 0", "0: must be"),
         ("bench --fps nan", "nan: must be"),
-        ("bench --t-max 5", "--t-max needs --interruption"),
-        ("bench --interruption --trace x.csv", "--trace cannot go with --interruption"),
+        ("bench --scenario interruption --trace x.csv", "--trace cannot go with interruption, which has no such"),
+        ("bench --scenario interruption:t_maxx=5", "unknown parameter 't_maxx'; did you mean 't_max'"),
         ("bench --nonsense", "--nonsense"),
         ("bench --size 3", "--size. Did you mean --sizes?"),
-        ("topics --suite fleet-v1", "suite fleet-v1 is not one of topics: bufgym bench --suite fleet-v1"),
-        ("topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
-        *((f"topics --{name} 2", f"--{name} needs --config") for name in ("trace", "motion", "scale")),
-        ("topics --by-topic afr", "--by-topic afr: not among the policies that run"),
+        ("bench --scenario topics --policies clairvoyant", "policy clairvoyant: it plans with a queue of its own"),
+        ("bench --scenario topics --by-topic afr", "--by-topic afr: not among the policies that run"),
         ("bench --report page.txt", "--report page.txt: must be FILE.html in a folder that there is"),
-        ("topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
-        ("topics --config no-such.toml", "error: no-such.toml: no such file\n"),
-        ("topics --config x.toml --suite topics-v1", "--suite cannot go with --config"),
+        ("bench --scenario topics --out rows.txt", "rows.txt: rows are written to .csv or .parquet files"),
+        ("bench --scenario no-such.toml", "error: no-such.toml: no such file\n"),
+        ("bench --scenario x.toml --suite topics-v1", "--scenario cannot go with --suite"),
+        ("topics --suite topics-v1", 'Unknown command "topics"'),
         ("bench --by-topic afr", "--by-topic needs several topics"),
-        ("bench --window 2", "--window needs --suite, --scenario or --config"),
         ("bench --scenario topics --max-bytes 9", "--max-bytes is for one queue"),
-        ("fleet --policies clairvoyant", "it plans with a link of its own, which no robot in a cell has"),
+        (
+            "bench --suite fleet-v1 --policies clairvoyant",
+            "it plans with a link of its own, which no robot in a cell has",
+        ),
     ],
 )
 def test_a_mistake_ends_in_a_sentence(command: str, message: str, capsys: Capsys) -> None:
@@ -112,7 +114,9 @@ def test_natural_inputs(tmp_path: Path, capsys: Capsys) -> None:
     shown([*QUICK, "--capacity", "2", "4", "--bytes", "4.6MB", "--format", "csv", "--out", out], capsys)
     assert [row["capacity"] for row in read_rows(out / "rows.csv")] == [2, 4]
     fails([*QUICK, "--out", out], "rows.csv: holds an earlier run's rows; choose another --out", capsys)
-    shown(["trace", "generate", "steady", "--rate", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys)
+    shown(
+        ["trace", "generate", "ramp", "--start", "20Mbit/s", "--end", "20Mbit/s", "--out", tmp_path / "s.csv"], capsys
+    )
     assert "2,500" in shown(["trace", "info", tmp_path / "s.csv"], capsys)
 
 
@@ -172,7 +176,7 @@ def test_help_tells_the_defaults_and_wraps_evenly(capsys: Capsys) -> None:
     for option, default in (("fps", lte.rate_hz), ("bytes", lte.size_bytes), ("seconds", lte.duration_s)):
         message = re.search(rf"--{option} .*?\(default:[ │\n]+([0-9]+)", text, re.DOTALL)
         assert message and float(message[1]) == default, option
-    box = text[text.index("─ Who runs ─") : text.index("─ The stream and its link")].splitlines()[1:-1]
+    box = text[text.index("─ Who runs ─") : text.index("─ The scenario, its stream")].splitlines()[1:-1]
     assert {len(line) - len(line[1:].lstrip()) for line in box if not line.startswith(("│ --", "╰"))} == {21}
     assert "▌" not in shown(["trace", "generate", "link", "--help"], capsys)
 

@@ -82,7 +82,7 @@ def test_the_parser_takes_each_command() -> None:
     assert not lacking, f"no page shows how to use the commands {lacking}: docs/guide/ has a page for each task"
     for command in commands:
         if app.parse_commands(command)[2]:
-            app.parse_args([*command, *(["x"] if command[-1] in ("--suite", "--config") else [])])
+            app.parse_args([*command, *(["x"] if command[-1] in ("--suite", "--config", "--scenario") else [])])
 
 
 def programs() -> list[tuple[str, str]]:
@@ -182,10 +182,10 @@ RUN = {
     r"bufgym bench --policies learned,afr": "--seconds 2 --seeds 1",
     r"bufgym bench --policy-file mine\.py --policies every-other.*": "--seconds 2 --seeds 1",
     r"bufgym bench --scenario-file .*": "--seeds 1",
-    r"bufgym topics --policy-file .*": "--config examples/client.toml --trace lte-synthetic-0 --seeds 1",
+    r"bufgym bench --policy-file urgent.py .*": "--trace lte-synthetic-0 --seeds 1",
     r"bufgym dataset make --kind mixed .*": "--episodes 3 --option duration_s=2.0",
     r"bufgym dataset make --suite lte-v1 .*": "--episodes 2 --out data",
-    r"bufgym topics --config \S+": "--seeds 1 --policies robofleet",
+    r"bufgym bench --scenario \S+\.toml": "--seeds 1 --policies robofleet",
     r"bufgym (--help|list \w+|trace fetch --list)": "",
     r"bufgym trace generate .*": "-o made.csv",
     r"bufgym play --policies .*": "--speed 1000 --steps 20",

@@ -149,7 +149,6 @@ def test_any_perceptron_of_up_to_three_layers_is_compiled(widths: list[int], act
         (DQN, "MlpPolicy", {}, {"fields": ["time_to_free", "rate_short"]}),
         (PPO, "MultiInputPolicy", {}, {"observation": "dict"}),
         (MaskablePPO, "MultiInputPolicy", {}, {"observation": "dict", "fields": ["rate_short", "time_to_free"]}),
-        (PPO, "MultiInputPolicy", {}, {"observation": "slots"}),
     ],
 )
 def test_other_networks_run_in_torch_for_every_L(algorithm: Any, policy: str, options: Any, env: Any) -> None:

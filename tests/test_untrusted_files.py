@@ -37,7 +37,7 @@ def test_toml_without_bounds_is_refused(tmp_path: Path, text: str | bytes, rule:
     assert str(error.value).count(str(path)) == 1
 
 
-@pytest.mark.parametrize("command", ["topics --config", "trace info", "trace from-bag", "report", "bench --workload"])
+@pytest.mark.parametrize("command", ["bench --scenario", "trace info", "trace from-bag", "report", "bench --workload"])
 def test_devices_and_fifos_are_refused(tmp_path: Path, command: str, capsys: Capsys) -> None:
     os.mkfifo(tmp_path / "fifo")
     for path in ("/dev/zero", str(tmp_path / "fifo")):

@@ -74,7 +74,7 @@ INTERFACES = """\
 *Above the default, below `actions="slots"`. Made by `python -m website.interfaces`*"""
 
 RETURN = """\
-Mean return with `reward_scale="episode"`, the `ep_rew_mean` that a learner's curve is compared with, and steps of an
+Mean return, the `ep_rew_mean` that a learner's curve is compared with, and steps of an
 episode: 100 episodes with the default arguments, by `python -m website.returns`."""
 
 

@@ -117,7 +117,7 @@ def _topics() -> Frames:
 
 def _rendered_topics(name: str, episode: Episode) -> list[NDArray[np.uint8]]:
     """Images of ``bufgym/Topics-v0`` at even times while this policy plays."""
-    env = SenderEnv("topics", 32, duration_s=20.0, render_mode="rgb_array", info="none")
+    env = SenderEnv("topics", 32, duration_s=20.0, render_mode="rgb_array", info="mask")
     senders, player = env.sub_envs.senders, Player(policies.get(name))
     env.reset(options={"episode": episode})
     times_us = np.linspace(0, int(episode.arrivals["arrival_us"][-1]), _COUNT + 1)[1:].tolist()
@@ -144,7 +144,7 @@ def _rendered_cell(name: str) -> tuple[str, list[NDArray[np.uint8]]]:
     """A title with how it ends, and images of ``FleetEnv`` while every robot plays this policy."""
     from bufgym.envs import FleetEnv
 
-    env = FleetEnv(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="none", render_mode="rgb_array")
+    env = FleetEnv(robots=8, capacity=8, duration_s=12.0, scale=(0.7,), info="mask", render_mode="rgb_array")
     env.reset(seed=1)
     player, senders, ticks = Player(policies.get(name), 8), env.sub_envs.senders, 12 * 30
     shown = set(np.linspace(ticks / _COUNT, ticks, _COUNT).astype(int).tolist())

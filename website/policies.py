@@ -21,7 +21,7 @@ PARTS = {
         " `clairvoyant`. `make docs` draws them."
     ),
     "Only where they are named": "`bufgym bench` leaves these out unless you name them.",
-    "For many topics": "These choose what to drop and what to send next. `bufgym topics` compares them.",
+    "For many topics": "These choose what to drop and what to send next: `bufgym bench --scenario topics`.",
 }
 
 

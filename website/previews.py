@@ -56,7 +56,7 @@ PREVIEWS = {
 def image(id: str) -> NDArray[np.uint8]:
     """The preview as uint8[400, 800, 3]; BufgymError if the episode ends before its moment."""
     preview = PREVIEWS[id]
-    options: dict[str, Any] = dict(preview.options) | {"render_mode": "rgb_array", "info": "none"}
+    options: dict[str, Any] = dict(preview.options) | {"render_mode": "rgb_array", "info": "mask"}
     if id == FLEET:
         env: Any = FleetEnv(**options)
     else:

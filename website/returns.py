@@ -38,7 +38,7 @@ def main() -> None:
     rows = []
     for id in HISTORY:
         for rule in RULES:
-            options: dict[str, Any] = {"reward_scale": "episode", "info": "none"}
+            options: dict[str, Any] = {"info": "mask"}
             cells = EPISODES // ROBOTS
             envs = FleetVecEnv(cells, ROBOTS, **options) if id == FLEET else gym.make_vec(id, EPISODES, **options)
             mean, steps = played(envs, rule)

@@ -27,6 +27,7 @@ from bufgym.scenario import FleetEpisode, FleetScenario, suites
 from bufgym.scenario.numbered import draw
 from bufgym.sim import Senders
 from bufgym.sim.cell import Fleet
+from bufgym.utils.errors import BufgymError
 
 VALIDATION_EPISODES = 4
 """Validation episodes per link, of the suite's own length."""
@@ -34,7 +35,11 @@ VALIDATION_EPISODES = 4
 
 def fleet_of(chosen: Suites, split: str) -> FleetScenario:
     """The robots of the one suite on all links of one split."""
-    (setting,) = suites.get(chosen.suite[0]).settings(split, chosen.data).values()
+    (name,) = chosen.names
+    found = suites.get(name).settings(split, chosen.data)
+    if len(found) > 1:
+        raise BufgymError(f"suite {name}: an agent for a fleet learns from one scenario, this has {len(found)}")
+    (setting,) = found.values()
     fleet: FleetScenario = setting.scenario
     return fleet
 
@@ -65,7 +70,7 @@ class FleetEpisodes:
 
 def validation_episodes(settings: Settings) -> list[FleetEpisodes]:
     """The validation episodes at every L, the same for every seed."""
-    (suite,), capacities = settings.suites.suite, settings.suites.capacities_of(settings.suites.suite[0])
+    (suite,), capacities = settings.suites.names, settings.suites.capacities_of(settings.suites.names[0])
     cells = len(capacities) * len(fleet_of(settings.suites, "validation").uplink.traces)
     seeds = settings.validations(VALIDATION_EPISODES, cells)
     sweep = Sweep(suite, (), "validation", seeds=seeds, data=settings.suites.data).checked()
@@ -93,7 +98,7 @@ class FleetObjective(Objective):
     def env(self, num_envs: int, reward: str, **options: Any) -> VecEnv:
         """Robots as rows, each rewarded for its own information, at the middle L; the agent serves every L."""
         chosen = self.settings.suites
-        fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.suite[0])
+        fleet, capacities = fleet_of(chosen, "train"), chosen.capacities_of(chosen.names[0])
         batch = FleetVecEnv(
             max(1, num_envs // fleet.robots),
             fleet.robots,

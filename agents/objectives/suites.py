@@ -40,7 +40,7 @@ class SuitesObjective(Objective):
         """Whole train splits, about as many rows of each scenario at each L."""
         chosen = self.settings.suites
         mixed = [
-            cell for suite in chosen.suite for cell in cells(suite, "train", chosen.capacities_of(suite), chosen.data)
+            cell for suite in chosen.names for cell in cells(suite, "train", chosen.capacities_of(suite), chosen.data)
         ]
         size = math.ceil(num_envs / len(mixed))
         return GymVecEnv(MixedEnv(mixed, [size] * len(mixed), reward=reward, **options))

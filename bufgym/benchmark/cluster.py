@@ -30,7 +30,8 @@ def spread(
 ) -> Iterator[Any]:
     """Run these (function, arguments), at most ``count``; yield the results as they become ready.
 
-    ``address`` names the head of the Ray or Dask cluster; None starts and ends a cluster on this machine.
+    ``address`` names the head of the Ray or Dask cluster, by default that of the environment variable RAY_ADDRESS or
+    DASK_SCHEDULER_ADDRESS; None in both starts and ends a cluster on this machine.
 
     Raises WorkerDiedError: results that other workers had not returned by then are lost.
     """
@@ -70,6 +71,7 @@ def _connected(backend: str, address: str | None) -> Iterator[None]:
 
 def dask_client(address: str | None) -> Any:
     distributed = library("distributed", "dask")
+    address = address or library("dask", "dask").config.get("scheduler-address", None)
     if address is not None:
         return distributed.Client(address)
     return distributed.Client(processes=True, threads_per_worker=1, dashboard_address=None)

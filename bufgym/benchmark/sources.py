@@ -48,13 +48,18 @@ def load(source: str, folder: str | None = None) -> str:
     known = _NAMES.get((place, source))
     if known is not None and known in policies.names():
         return known
-    policy = _from_file(source, place) if source.endswith(_FILES) else _from_module(source, place)
+    read = _from_file if source.endswith(_FILES) else _from_module
+    name = _NAMES[place, source] = _registered(read(source, place), source)
+    return name
+
+
+def _registered(policy: Policy, source: str) -> str:
+    """The policy's name, once it is registered."""
     if registry.registered_as(policy.on_arrival) is not policy:
         if policy.name in policies.names():
             raise BufgymError(f"{source}: there is a policy named {policy.name!r} already; give this one another name")
         given = {f.name: getattr(policy, f.name) for f in fields(Policy) if f.name not in ("name", "on_arrival")}
         registry.register(policy.name, **given)(policy.on_arrival)
-    _NAMES[place, source] = policy.name
     return policy.name
 
 
@@ -140,14 +145,9 @@ def _from_file(source: str, folder: str) -> Policy:
 
 
 def _from_module(source: str, folder: str) -> Policy:
-    modules.imported(source, folder, "a policy")
-    found = modules.find(source, folder)
+    found = modules.made(source, folder, also="a policy")
     if isinstance(found, Policy):
         return found
-    if callable(found) and modules.needs(found) == 0:
-        found = found()
-        if isinstance(found, Policy):
-            return found
     if not callable(found) or modules.needs(found) != 3:
         rule = "must be a policy, a function (buffer, arrival, memory), or one without arguments that makes either"
         raise BufgymError(f"{source}: {rule}")

@@ -27,8 +27,6 @@ _formatwarning = warnings.formatwarning
 COMMANDS: dict[str, Any] = {
     "list": "bufgym.cli.listing:listing",
     "bench": "bufgym.cli.bench:bench",
-    "topics": "bufgym.cli.bench:topics",
-    "fleet": "bufgym.cli.bench:fleet",
     "report": "bufgym.cli.results:report",
     "leaderboard": "bufgym.cli.results:leaderboard",
     "validate": "bufgym.cli.results:validate",

@@ -1,22 +1,18 @@
-"""``bufgym bench``: policies side by side on the same episodes.
-
-``topics`` and ``fleet`` are names for it with a suite of that kind, or one's own client.
-"""
+"""``bufgym bench``: policies side by side on the same episodes."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
 from bufgym.cli.options import (
     RESULTS,
     Bytes,
-    Count,
     OutOptions,
     SuiteOptions,
     WhoOptions,
@@ -25,16 +21,7 @@ from bufgym.cli.options import (
     load_policies,
     refuse,
 )
-from bufgym.cli.scenarios import (
-    InterruptionOptions,
-    LinkOptions,
-    OwnOptions,
-    ScenarioOptions,
-    SendOptions,
-    SharedOptions,
-    StreamOptions,
-    WorkloadOptions,
-)
+from bufgym.cli.scenarios import Described, StreamOptions, WorkloadOptions, described
 from bufgym.utils.errors import BufgymError
 from bufgym.utils.progress import bar
 
@@ -44,13 +31,11 @@ if TYPE_CHECKING:
     from bufgym.policies import Policy
 
 
-@Parameter(name="*", group=Group.create_ordered("How the buffer decides"))
+@Parameter(name="*", group=Group.create_ordered("The buffer"))
 @dataclass(frozen=True)
 class BufferOptions:
     max_bytes: Bytes | None = None
     """Also at most so many bytes queued, as in 9.2MB (default: no limit)."""
-    decide_at: Literal["arrival", "overflow"] | None = None
-    """Ask at every arrival (default), or when full."""
     no_bound: Annotated[bool, Parameter(negative="")] = False
     """Leave out the clairvoyant, whose time it saves; regret and score are measured against it."""
 
@@ -70,9 +55,6 @@ def bench(
     who: WhoOptions = WhoOptions(),
     stream: StreamOptions = StreamOptions(),
     workload: WorkloadOptions = WorkloadOptions(),
-    interruption: InterruptionOptions = InterruptionOptions(),
-    own: OwnOptions = OwnOptions(),
-    shared: SharedOptions = SharedOptions(),
     buffer: BufferOptions = BufferOptions(),
     out: OutOptions = OutOptions(),
     drops: Annotated[str | None, Parameter(group=RESULTS)] = None,
@@ -90,13 +72,12 @@ def bench(
     from bufgym.traces.formats.splits import is_recording
 
     load_policies(who.policy_file)
-    options = ScenarioOptions(stream, workload, interruption, own, shared)
-    command = _command(suite, who, options, buffer, out)
+    command = _command(suite, who, stream, workload, buffer, out)
     if suite.suite is not None:
-        frozen = options.given() | given(buffer)
+        frozen = given(stream) | given(workload) | given(buffer)
         frozen |= {name: value for name, value in (("drops", drops), ("mcap", mcap)) if value is not None}
         refuse(frozen, "cannot go with --suite: a suite's episodes are frozen")
-        experiment = _on_suite(suite, who, given(shared), command)
+        experiment = _on_suite(suite, who, command)
     else:
         refuse(given(suite, "split", "data"), "needs --suite")
         if drops is not None and workload.workload is None:
@@ -105,8 +86,8 @@ def bench(
             raise BufgymError(f"--mcap {mcap}: must be FILE.mcap, and needs --workload")
         if mcap is not None and not all(map(is_recording, workload.workload or [])):
             raise BufgymError(f"--mcap {mcap}: needs a recording that holds the messages themselves (MCAP, ROS bag)")
-        experiment = _on_scenario(options, buffer, who.seeds)
-        processes = given(suite, "jobs", "backend", "address")
+        experiment = _on_scenario(described(stream, workload, who.seeds), buffer, who.seeds)
+        processes = given(suite, "jobs", "backend")
         experiment.arguments.update(processes, **({"policy_file": who.policy_file} if who.policy_file else {}))
     entrants, rival = who.entrants(experiment.task), who.rival()
     topic_policy = out.topic_policy(experiment.task, [*entrants, *([] if rival is None else [rival])])
@@ -145,7 +126,12 @@ def bench(
 
 
 def _command(
-    suite: SuiteOptions, who: WhoOptions, options: ScenarioOptions, buffer: BufferOptions, out: OutOptions
+    suite: SuiteOptions,
+    who: WhoOptions,
+    stream: StreamOptions,
+    workload: WorkloadOptions,
+    buffer: BufferOptions,
+    out: OutOptions,
 ) -> str:
     """The command that runs this again: a suite's keeps its folder, any other makes its page."""
     kept = {"report": out.report} if suite.suite is None else {"by_topic": out.by_topic, "out": out.out}
@@ -157,8 +143,8 @@ def _command(
         capacity=who.capacity,
         seeds=who.seeds,
         against=who.against,
-        **options.given(),
-        **given(options.shared),
+        **given(stream),
+        **given(workload),
         **given(buffer),
         policy_file=who.policy_file,
         data=suite.data,
@@ -166,23 +152,23 @@ def _command(
     )
 
 
-def _on_suite(suite: SuiteOptions, who: WhoOptions, changes: dict[str, Any], command: str) -> Experiment:
+def _on_suite(suite: SuiteOptions, who: WhoOptions, command: str) -> Experiment:
     from bufgym.benchmark.tasks import task_of
     from bufgym.scenario import suites
 
     name = suites.named(suite.suite or "")
     arguments = {name: value for name, value in given(suite).items() if name != "suite"}
-    arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "changes": changes, "command": command}
+    arguments |= {"seeds": who.seeds, "policy_file": who.policy_file, "command": command}
     return Experiment(name, task_of(name), arguments)
 
 
-def _on_scenario(options: ScenarioOptions, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
+def _on_scenario(what: Described, buffer: BufferOptions, asked_seeds: int | None) -> Experiment:
     from bufgym.benchmark.tasks import task_for
 
-    scenario, lines, label, recorded, facts = options.scenario(asked_seeds)
+    scenario, lines, label, recorded, facts = what
     if task_for(scenario).kind != "queue":
         refuse(given(buffer), "is for one queue")
-    of_a_queue = given(buffer, "max_bytes", "decide_at") | ({"bound": False} if buffer.no_bound else {})
+    of_a_queue = given(buffer, "max_bytes") | ({"bound": False} if buffer.no_bound else {})
     task = task_for(scenario, **of_a_queue)
     seeds = asked_seeds or (1 if recorded else task.seeds)
     about = [*lines, *_about(scenario, task, None if recorded and asked_seeds is None else seeds), *facts]
@@ -223,7 +209,7 @@ def _print_drops(
     several = len(scenario.workload.summary()) > 1
     if not several and file is None:
         return
-    settings = {name: value for name, value in experiment.arguments.items() if name in ("max_bytes", "decide_at")}
+    settings = {name: value for name, value in experiment.arguments.items() if name == "max_bytes"}
     messages = drops.drops(players, scenario, capacity, seeds, **settings)
     counts = drops.write_drops(messages, None if file is None else Path(file))
     if several and counts:
@@ -239,59 +225,9 @@ def _write_playback(
     """Write an episode of a recording as the policies would have sent it."""
     from bufgym.benchmark.playback import write_playback
 
-    settings = {name: value for name, value in experiment.arguments.items() if name in ("max_bytes", "decide_at")}
+    settings = {name: value for name, value in experiment.arguments.items() if name == "max_bytes"}
     with bar(None, True, "message") as advance:
         counts = write_playback(file, recording, players, experiment.on, capacity, advance=advance, **settings)
     print(f"\nwrote {file}, L = {capacity}:")
     for name, (delivered, dropped) in counts.items():
         print(f"  /{name}/delivered/...: {delivered:,}, /{name}/dropped/...: {dropped:,}, /{name}/queue")
-
-
-CLIENT = Group.create_ordered("Or a client of your own")
-
-
-def topics(
-    *,
-    suite: SuiteOptions = SuiteOptions(),
-    config: Annotated[str | None, Parameter(group=CLIENT)] = None,
-    link: Annotated[LinkOptions, Parameter(group=CLIENT)] = LinkOptions(),
-    send: Annotated[SendOptions, Parameter(group=Group.create_ordered("How the client sends"))] = SendOptions(),
-    who: WhoOptions = WhoOptions(),
-    out: OutOptions = OutOptions(),
-) -> None:
-    """Run policies side by side on several topics over one uplink.
-
-    Args:
-        config: Its topics and their rules, as in examples/client.toml.
-    """
-    if config is None:
-        refuse(given(link), "needs --config: a suite's episodes are frozen")
-        suite = _suite_of(suite, "topics", "topics-v1")
-    else:
-        refuse(given(suite), "cannot go with --config")
-    stream, shared = StreamOptions(**vars(link)), SharedOptions(**vars(send))
-    bench(suite=suite, stream=stream, own=OwnOptions(config=config), shared=shared, who=who, out=out)
-
-
-def fleet(
-    *,
-    suite: SuiteOptions = SuiteOptions(),
-    robots: Annotated[Count | None, Parameter(group=Group.create_ordered("The cell"))] = None,
-    who: WhoOptions = WhoOptions(),
-    out: OutOptions = OutOptions(),
-) -> None:
-    """Run policies side by side on robots that share one cell.
-
-    Args:
-        robots: That share the cell, whose capacity grows with them (default: 16).
-    """
-    bench(suite=_suite_of(suite, "fleet", "fleet-v1"), shared=SharedOptions(robots=robots), who=who, out=out)
-
-
-def _suite_of(options: SuiteOptions, kind: str, default: str) -> SuiteOptions:
-    from bufgym.scenario import suites
-
-    suite = suites.get(suites.named(options.suite or default))
-    if suite.kind != kind:
-        raise BufgymError(f"suite {suite.name} is not one of {kind}: bufgym bench --suite {suite.name}")
-    return replace(options, suite=suite.source or suite.name)

@@ -3,19 +3,18 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, get_args
 
-from bufgym.cli.options import PolicyFile, columns, load_policies
+from bufgym.cli.options import columns
 from bufgym.utils.modules import first_line
 
 Kind = Literal["environments", "scenarios", "suites", "policies", "values", "rewards", "observations", "traces"]
 
 
-def listing(what: Kind | None = None, /, *, policy_file: PolicyFile = None) -> None:
+def listing(what: Kind | None = None, /) -> None:
     """List what there is: environments, scenarios, policies and more.
 
     Args:
         what: Only these.
     """
-    load_policies(policy_file)
     print("\n\n".join(f"{kind}\n{LISTS[kind]()}" for kind in LISTS if what in (None, kind)))
 
 

@@ -92,8 +92,8 @@ PolicyFile: TypeAlias = Annotated[
 @dataclass(frozen=True)
 class SuiteOptions:
     suite: str | None = None
-    """Which ('bufgym list suites'; default of topics: topics-v1, of fleet: fleet-v1), or module:NAME, your own
-    bufgym.suite(...), whose code is run; --out DIR keeps it, a second call resumes it."""
+    """Which ('bufgym list suites'), or module:NAME, your own bufgym.suite(...), whose code is run; --out DIR keeps it,
+    a second call resumes it."""
     split: str | None = None
     """train, validation or test (default: test)."""
     data: str | None = None
@@ -101,9 +101,8 @@ class SuiteOptions:
     jobs: Whole | None = None
     """Processes side by side, -1 for one a core (default: a suite one a core, any other one)."""
     backend: str | None = None
-    """loky (default), threading, sequential, ray or dask."""
-    address: str | None = None
-    """Head of the Ray or Dask cluster (default: one on this machine)."""
+    """loky (default), threading, sequential, ray or dask (on the cluster of RAY_ADDRESS or DASK_SCHEDULER_ADDRESS, else
+    on this machine)."""
 
 
 @Parameter(name="*", group=Group.create_ordered("Who runs"))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bufgym.cli.listing import environments
-from bufgym.cli.options import Count, Natural, PerSecond, PolicyFile, one_policy
+from bufgym.cli.options import Count, Natural, PerSecond, one_policy
 from bufgym.utils.errors import BufgymError, unknown
 from bufgym.utils.files import replaced
 from bufgym.utils.libraries import library
@@ -24,7 +24,6 @@ def play(
     speed: PerSecond = 5.0,
     steps: Count = 200,
     out: Path | None = None,
-    policy_file: PolicyFile = None,
 ) -> None:
     """Watch a policy decide, in the terminal.
 
@@ -44,7 +43,7 @@ def play(
     from bufgym.envs.expert import Player
     from bufgym.scenario.numbered import draw
 
-    policy = one_policy(policies, policy_file)
+    policy = one_policy(policies)
     known = environments()
     id = env if "/" in env else f"bufgym/{env}"
     if id not in known:

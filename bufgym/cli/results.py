@@ -76,18 +76,17 @@ def validate(row: str, /, *, file: Path = Path(DEFAULT), data: str | None = None
         print(f"  {key}: {again.values[key].value:.6f} now, {stated:.6f} [{low:.6f}, {high:.6f}] in {file}")
 
 
-def curves(*runs: str, out: Path, measure: str | None = None) -> None:
+def curves(*runs: str, out: Path) -> None:
     """Draw learning curves over training seeds, with 95 % intervals.
 
     Args:
         runs: Folders of runs, such as runs/train-1, with a folder seed-N for each seed: of train.py, or with the
             0.monitor.csv that make_vec_env(monitor_dir=...) writes.
         out: The picture, .svg, .png or .pdf.
-        measure: Which column (default: the last of validation.csv, or the return).
     """
     from bufgym.benchmark.curves import curves as draw
 
-    for curve in draw(runs, out, measure):
+    for curve in draw(runs, out):
         reach = curve.reach[-1]
         within = "" if reach != reach else f" [{curve.mean[-1] - reach:.3f}, {curve.mean[-1] + reach:.3f}]"
         print(f"{curve.name}: {curve.measure} {curve.mean[-1]:.3f}{within} after {curve.steps[-1]:,.0f} steps")

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from bufgym.traces.formats.bags import Bag
     from bufgym.traces.workload import TopicSummary
 
-MOTION = ("fov_deg", "scene_scale_m", "rate_hz", "max_gap_s")  # Options of ``MotionOptions``
-
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -36,20 +34,18 @@ class MotionOptions:
     """Moving this far shows a new scene, m (default: 2)."""
     rate_hz: Positive | None = None
     """Compare poses at most so often, 1/s; less is less noise (default: 30)."""
-    max_gap_s: Positive | None = None
-    """Longer times without a pose are gaps, s (default: 1)."""
 
     def settings(self) -> MotionSettings | None:
         """How motion is measured; None if none of the options was given."""
         from bufgym.traces import MotionSettings
 
-        values = given(self, *MOTION)
+        values = given(self)
         return MotionSettings(**values) if values else None
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class RecordingOptions(MotionOptions):
+class RecordingOptions:
     topics: list[str] | None = None
     """Topics, by name or pattern ('/camera/*'); default: all."""
     odom: str | None = None
@@ -60,13 +56,14 @@ class RecordingOptions(MotionOptions):
     clock: str | None = None
     """Arrivals by a recording's log times ("log", the default), or by the clock of its header stamps ("stamps")."""
 
-    def arguments(self) -> dict[str, Any]:
-        """Collect those given for ``read_workload``; motion options need odometry."""
+    def arguments(self, measured: MotionOptions | None = None) -> dict[str, Any]:
+        """Collect those given for ``read_workload``, whose odometry becomes motion as ``measured`` says."""
         arguments: dict[str, Any] = given(self, "clock")
         if self.topics is not None:
             arguments["topics"] = [name for text in self.topics for name in text.split(",") if name]
         if self.odom is not None:
-            arguments.update(odom=self.odom, bridge_gaps=self.bridge_gaps, settings=self.settings())
+            arguments.update(odom=self.odom, bridge_gaps=self.bridge_gaps)
+            arguments["settings"] = None if measured is None else measured.settings()
         elif self.bridge_gaps:
             raise BufgymError("--bridge-gaps needs --odom")
         return arguments
@@ -99,6 +96,7 @@ def from_bag(
     /,
     *,
     recording: RecordingOptions = RecordingOptions(),
+    measured: MotionOptions = MotionOptions(),
     out: Annotated[Path | None, Parameter(alias="-o")] = None,
 ) -> None:
     """Take messages and motion from a robot's recording (extra 'ros').
@@ -109,9 +107,9 @@ def from_bag(
     """
     from bufgym.traces import read_bag, workload_from_bag, write_workload_csv
 
-    arguments = recording.arguments()
+    arguments = recording.arguments(measured)
     if recording.odom is None:
-        refuse(given(recording, *MOTION), "needs --odom")
+        refuse(given(measured), "needs --odom")
     with bar(None, True, "message") as advance:
         bag = read_bag(files, arguments.pop("odom", None), advance, arguments.pop("clock", "log"))
     if recording.topics is None and out is None and recording.odom is None:

@@ -23,15 +23,13 @@ def fetch(
     /,
     *,
     list: bool = False,
-    to: str | None = None,
     local_files: Annotated[tuple[str, ...], Parameter(name="--from")] = (),
 ) -> None:
     """Download a public data set of traces, trajectories or recordings.
 
     Args:
         name: A data set; --list names them.
-        list: Name the data sets, or all that is known of one.
-        to: The folder for data sets, instead of the cache folder.
+        list: Name the data sets, or all that is known of one, and the folder that they go to (XDG_CACHE_HOME moves it).
         local_files: Files fetched by hand: download nothing.
     """
     from bufgym.traces.datasets.fetch import fetch_dataset
@@ -51,7 +49,7 @@ def fetch(
         by_hand = [("address", f"{NOT_KNOWN}: fetch by hand from the page, then --from FILE")]
         print(f"{dataset.name}\n{columns(_about(dataset))}\n{columns(files or by_hand)}".rstrip())
         return
-    fetched = fetch_dataset(dataset, to, local_files, note=lambda sentence: print(sentence, file=sys.stderr))
+    fetched = fetch_dataset(dataset, None, local_files, note=lambda sentence: print(sentence, file=sys.stderr))
     print(f"{dataset.name}\n{columns([*_results(fetched), *_about(dataset)])}")
 
 

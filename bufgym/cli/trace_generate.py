@@ -60,7 +60,6 @@ def _link(name: str, about: str, make: Callable[..., Trace]) -> None:
 
 
 _link("link", "A mobile link as recorded in trams, trains, ... (or in WiFi).", traces.markov_link)
-_link("steady", "One rate throughout.", traces.steady)
 _link("ramp", "A rate that changes evenly.", traces.ramp)
 _link("tunnel", "Steady, fade, blackout, fade in, steady.", traces.tunnel)
 

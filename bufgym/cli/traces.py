@@ -16,7 +16,7 @@ from bufgym.utils.libraries import library
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from bufgym.traces import Trace
+    from bufgym.traces import Columns, Trace
 
 _PICTURES = (".png", ".svg", ".pdf")
 _MOST_DRAWN = 5_000  # most rates in a picture some 1300 pixels wide; more rates are averaged over this many windows
@@ -32,6 +32,19 @@ class ReadOptions:
     """The files' format (default: detected)."""
     column: str | None = None
     """Of UCC files (DL_bitrate, UL_bitrate), of iperf3 --bidir (upload, download), or which run of a list."""
+    holes: Holes = "hold"
+    """Stretches without samples: hold the rate before, send nothing ("zero"), or refuse."""
+
+    def load(self, name: str, columns: Columns | None = None) -> Trace:
+        """The trace of this name or file."""
+        from bufgym import traces
+
+        return traces.load(name, self.format, column=self.column, columns=columns, holes=self.holes)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ColumnOptions:
     time: str | None = None
     """Of any table: the column of times, by name or number; with --rate."""
     rate: str | None = None
@@ -40,25 +53,19 @@ class ReadOptions:
     """Unit of the rates: B/s, kB/s, Mbit/s, ..."""
     time_unit: str = ""
     """Unit of the times: s, ms, us, ns (default: that in the column's name, else s)."""
-    holes: Holes = "hold"
-    """Stretches without samples: hold the rate before, send nothing ("zero"), or refuse."""
 
-    def load(self, name: str) -> Trace:
-        """The trace of this name or file."""
+    def chosen(self) -> Columns | None:
+        """The columns of a table; None where the file's format says them."""
         from bufgym import traces
 
-        columns = None
         if self.time is not None and self.rate is not None:
-            columns = traces.Columns(self.time, self.rate, self.unit, self.time_unit)
-        elif self.time != self.rate:
+            return traces.Columns(self.time, self.rate, self.unit, self.time_unit)
+        if self.time != self.rate:
             raise BufgymError("--time and --rate go together")
-        return traces.load(name, self.format, column=self.column, columns=columns, holes=self.holes)
+        return None
 
 
-Read = ReadOptions()
-
-
-def info(files: Files, /, *, read: ReadOptions = Read) -> int:
+def info(files: Files, /, *, read: ReadOptions = ReadOptions()) -> int:
     """Print statistics of bandwidth traces; exit code 2 if one is not sound."""
     from bufgym import traces
 
@@ -82,14 +89,14 @@ def info(files: Files, /, *, read: ReadOptions = Read) -> int:
     return 2 if failed else 0
 
 
-def validate(files: Files, /, *, read: ReadOptions = Read) -> int:
+def validate(files: Files, /) -> int:
     """Read each file and say whether it is sound; exit code 1 if not all."""
     from bufgym import traces
 
     failed = 0
     for name in files:
         try:
-            trace = read.load(name)
+            trace = traces.load(name)
         except TraceError as error:
             failed += 1
             print(f"error  {error}")
@@ -101,7 +108,15 @@ def validate(files: Files, /, *, read: ReadOptions = Read) -> int:
     return 1 if failed else 0
 
 
-def convert(files: Files, /, *, out: Path, to: str | None = None, read: ReadOptions = Read) -> None:
+def convert(
+    files: Files,
+    /,
+    *,
+    out: Path,
+    to: str | None = None,
+    read: ReadOptions = ReadOptions(),
+    columns: ColumnOptions = ColumnOptions(),
+) -> None:
     """Write bandwidth traces in another format and name the loss.
 
     Args:
@@ -114,8 +129,9 @@ def convert(files: Files, /, *, out: Path, to: str | None = None, read: ReadOpti
     if to not in traces.WRITERS:
         option = f"--to {to}" if to else f"--out {out}: does not tell the format; --to"
         raise BufgymError(f"{option}: must be one of {', '.join(traces.WRITERS)}")
+    chosen = columns.chosen()
     for name, target in _targets(files, out, to):
-        trace = read.load(name)
+        trace = read.load(name, chosen)
         traces.WRITERS[to](trace, target)
         lost = traces.difference(trace, traces.read_trace(target, to))
         print(printable(f"wrote {target} (format {to}) from {trace.source}: {lost}"))
@@ -138,17 +154,18 @@ def _targets(names: list[str], out: Path, to: str) -> list[tuple[str, Path]]:
     return targets
 
 
-def plot(files: Files, /, *, out: Path, read: ReadOptions = Read) -> None:
+def plot(files: Files, /, *, out: Path) -> None:
     """Draw bandwidth traces (needs the extra 'plot').
 
     Args:
         out: The picture to write: .png, .svg or .pdf.
     """
+    from bufgym import traces
 
     figures = library("matplotlib.figure", "plot", "drawing")
     if out.suffix not in _PICTURES:
         raise BufgymError(f"--out {out}: must end in {', '.join(_PICTURES[:-1])} or {_PICTURES[-1]}")
-    loaded = [read.load(name) for name in files]
+    loaded = [traces.load(name) for name in files]
     figure = figures.Figure(figsize=(9, 0.8 + 2 * len(loaded)), layout="constrained")
     axes = figure.subplots(len(loaded), 1, squeeze=False)[:, 0]
     for axis, trace in zip(axes, loaded, strict=True):

@@ -1,9 +1,8 @@
 """Forms of an observation; each is a view of the flat row of numbers that kernels write."""
 
-import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -14,8 +13,6 @@ from bufgym.utils.errors import BufgymError, unknown
 
 Observation = Any
 """A dict of arrays; for "flat", one array."""
-
-FORMS = ("dict", "flat", "slots")  # Names of the forms, which ``ObservationForm`` explains
 
 
 class Place(NamedTuple):
@@ -32,53 +29,24 @@ class Place(NamedTuple):
     entries: int
 
 
-class MaskKeys(NamedTuple):
-    """Keys of an observation that holds the action mask.
-
-    Fields:
-        observation: key of what else is observed; None if the mask lies beside the fields.
-        mask: key of the mask.
-        dtype: "int8" or "bool".
-    """
-
-    observation: str | None
-    mask: str
-    dtype: str
-
-    def put(self, observation: Any, mask: Any) -> Any:
-        """One dict of both; with the mask beside the fields, the ``observation`` itself, a dict of the caller's own."""
-        if self.observation is not None:
-            return {self.observation: observation, self.mask: mask}
-        observation[self.mask] = mask
-        return observation
-
-    def space(self, observation: Any, actions: int) -> spaces.Dict:
-        """The space of the observation with the mask of so many ``actions``."""
-        both = self.put(observation, spaces.Box(0, 1, (actions,), np.dtype(self.dtype).type))
-        return both if self.observation is None else spaces.Dict(OrderedDict(both))
-
-
 class ObservationForm:
     """The observed fields of a queue of L = ``capacity`` messages, and the form of the observation.
 
     A row of numbers first holds the fields of the tables (``table_numbers``): slot fields with L + 1 entries each, the
     newcomer's last, or candidate fields with k + 1 entries each, the head's last; then context fields. Other chosen
-    fields follow at ``places``. Where ``only_chosen``, a row holds the chosen fields alone. ``form`` is one of
+    fields follow at ``places``. Where ``only_chosen``, a row holds the chosen fields alone.
 
-    - "dict", an array for each field, [L + 1], [k + 1] or [1],
-    - "flat", the row itself, equal to the dict under ``gymnasium.wrappers.FlattenObservation``,
-    - "slots", with ``slots`` [L + 1, slot fields] and ``context`` [context fields], for attention networks; of
-      candidates ``slots`` is [k + 1, candidate fields].
+    ``form`` is "dict", an array for each field, [L + 1], [k + 1] or [1]; or "flat", the row itself, equal to the dict
+    under ``gymnasium.wrappers.FlattenObservation``.
 
     Only fields named in ``chosen`` are observed, by default all of the tables. They keep the order of the tables, slots
     before the context, and other fields come last in each. Candidate fields and their context are always observed, and
-    named fields follow; in the form "slots" these are numbers of ``context``. ``has_slots`` says whether rows hold slot
-    fields of the tables. Where ``is_view``, an observation is a dict of views; where ``is_row``, the row itself.
-    ``named`` are the built-in fields that are observed only because they are named; None if there are none,
-    and the row holds tables.
-    ``own_places`` are the places of your own fields.
-    ``space`` is the Gymnasium space of one observation, ``numbers`` the length of a row. Where ``mask`` has keys,
-    ``masked`` puts the mask of all ``actions`` into an observation. ``candidates`` is k.
+    named fields follow.
+
+    ``has_slots`` says whether rows hold slot fields of the tables. Where ``is_row``, an observation is the row itself.
+    ``named`` are the built-in fields that are observed only because they are named; None if there are none, and the row
+    holds tables. ``own_places`` are the places of your own fields. ``space`` is the Gymnasium space of one observation,
+    ``numbers`` the length of a row. ``candidates`` is k.
     """
 
     def __init__(
@@ -88,14 +56,10 @@ class ObservationForm:
         context_fields: Sequence[Field],
         capacity: int,
         chosen: Sequence[str] | None = None,
-        mask: MaskKeys | None = None,
         *,
         candidates: int = 0,
-        actions: int = 0,
         only_chosen: bool = False,
     ) -> None:
-        if form not in FORMS:
-            raise BufgymError(f"observation = {form!r}: must be one of {', '.join(map(repr, FORMS))}")
         known = {field.name: field for field in (*slot_fields, *context_fields)}
         others: dict[str, Field] = {}
         names = [*known] if chosen is None or candidates else []
@@ -110,8 +74,7 @@ class ObservationForm:
             raise BufgymError("fields: choose at least one field to observe")
         self.form, self.has_slots = form, bool(slot_fields) and not only_chosen
         widths = {"slot": capacity + 1, "candidate": candidates + 1, "context": 1}
-        per_entry = "candidate" if candidates else "slot"
-        self._width = widths[per_entry]
+        self._width = widths["candidate" if candidates else "slot"]
         self._slot_fields, self._context_fields = len(slot_fields), len(context_fields)
         self._first_context = self._slot_fields * self._width
         self.table_numbers = 0 if only_chosen else self._first_context + self._context_fields
@@ -129,10 +92,8 @@ class ObservationForm:
             self.numbers = max(self.numbers, first + entries)
         numbers = np.concatenate([np.arange(place.first, place.first + place.entries) for place in self.places])
         everything = np.array_equal(numbers, np.arange(self.numbers))
-        self.is_view = form == "dict" or (form == "slots" and everything)
         self.is_row = form == "flat" and everything
         self._numbers = None if everything else numbers
-        self._per_slot = sum(place.field.per == per_entry for place in self.places)
         beside = [place for place in self.places if place.first >= self.table_numbers]
         built_in = [place for place in beside if place.field in BUILT_IN.values()]
         firsts = {place.field.name: place.first for place in built_in}
@@ -141,14 +102,9 @@ class ObservationForm:
         low, high = np.zeros((2, self.numbers), np.float32)
         for field, first, entries in self.places:
             low[first : first + entries], high[first : first + entries] = field.low, field.high
-        self.mask, space = mask, _space(self.of(low), self.of(high))
+        self.space: Any = _space(self.of(low), self.of(high))
         if form == "flat":  # numbers have no names, so the space has them, and takes them into a model's file
-            space.fields = {place.field.name: place.entries for place in self.places}
-        self.space: Any = space if mask is None else mask.space(space, actions or capacity + 2)
-
-    def masked(self, observation: Observation, mask: NDArray[np.int8]) -> Observation:
-        """The observation, an array or a dict of the caller's own, with a view of the mask if this form has one."""
-        return observation if self.mask is None else self.mask.put(observation, mask.view(self.mask.dtype))
+            self.space.fields = {place.field.name: place.entries for place in self.places}
 
     def split(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Split ``rows`` (one row or n) into views: slots [(n,) fields, L + 1] and context [(n,) fields]."""
@@ -159,20 +115,13 @@ class ObservationForm:
         """The observation of ``rows``, one row of numbers or n, in this form."""
         if self.form == "dict":
             return {place.field.name: rows[..., place.first : place.first + place.entries] for place in self.places}
-        rows = rows if self._numbers is None else rows.take(self._numbers, axis=-1)
-        if self.form == "flat":
-            return rows
-        first = self._per_slot * self._width
-        slots = rows[..., :first].reshape(*rows.shape[:-1], self._per_slot, self._width)
-        parts = {"slots": slots.swapaxes(-1, -2), "context": rows[..., first:]}
-        return {name: part for name, part in parts.items() if part.size}
+        return rows if self._numbers is None else rows.take(self._numbers, axis=-1)
 
 
 def fields_of(space: Any) -> dict[str, int] | None:
     """The fields that a space names, "dict" or "flat", with the count of each one's numbers; None if it names none."""
     if isinstance(space, spaces.Dict):
-        slots = {"slots", "context"} & set(space)
-        return None if slots else {name: spaces.flatdim(part) for name, part in space.items()}
+        return {name: spaces.flatdim(part) for name, part in space.items()}
     return getattr(space, "fields", None)
 
 
@@ -190,56 +139,3 @@ def _space(low: Observation, high: Observation) -> Any:
         return spaces.Box(low, high)
     # Gymnasium sorts the keys of any mapping but an OrderedDict, and so would flatten in another order.
     return spaces.Dict(OrderedDict((name, spaces.Box(low[name], high[name])) for name in low))
-
-
-Buffers = TypeVar("Buffers")
-
-
-class BufferPool(Generic[Buffers]):
-    """Arrays for results, used again once the caller has let go of them, so that a step allocates nothing.
-
-    Python counts the references to an array. As long as there are more to one of the arrays, or to a view of it, than
-    when it was made, the caller holds it, and it is not written again. Without the pool a step of 64 environments takes
-    50 us in place of 36 with candidates, and 88 in place of 42 with slots. One environment with slots takes 14 us in
-    place of 5.4; with candidates its 27 numbers are copied, which takes no pool.
-    """
-
-    def __init__(self, make: Callable[[], tuple[Buffers, Sequence[NDArray[Any]]]]) -> None:
-        """``make`` returns new buffers, and their arrays with all views of them that are returned."""
-        self._make = make
-        self._pool: list[tuple[Buffers, Sequence[NDArray[Any]], list[int]]] = []
-
-    def take(self) -> Buffers:
-        """Buffers that nobody holds, with any content."""
-        for buffers, arrays, references_when_free in self._pool:
-            if list(map(sys.getrefcount, arrays)) == references_when_free:
-                return buffers
-        buffers, arrays = self._make()
-        # The oldest leave the pool, as a caller that collects results holds them all.
-        self._pool = [*self._pool[1 - _POOLED :], (buffers, arrays, list(map(sys.getrefcount, arrays)))]
-        return buffers
-
-
-_POOLED = 4  # Most buffers in a pool
-
-
-class Handed:
-    """Returns observations of one row. Making a dict of twenty views costs more than a step, so a pool holds them."""
-
-    def __init__(self, form: ObservationForm) -> None:
-        self._form = form
-        self._pool = BufferPool(self._new)
-
-    def of(self, row: NDArray[np.float32]) -> Observation:
-        """The observation of this row of numbers, which is copied."""
-        if self._form.form != "dict":
-            return row.copy() if self._form.is_row else self._form.of(row.copy())
-        numbers, views = self._pool.take()
-        numbers[:] = row
-        return views.copy()
-
-    def _new(self) -> Any:
-        """A row of numbers and the views of it."""
-        numbers = np.empty(self._form.numbers, np.float32)
-        views = self._form.of(numbers)
-        return (numbers, views), [numbers, *views.values()]

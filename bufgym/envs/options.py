@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from bufgym import scenario as scenarios
-from bufgym.envs.observation import MaskKeys
-from bufgym.model.checks import above_0, flag, whole
+from bufgym.model.checks import flag, whole
 from bufgym.model.observe.candidates import MOST_CANDIDATES
 from bufgym.policies import Policy
 from bufgym.scenario import Scenario
@@ -20,16 +19,9 @@ if TYPE_CHECKING:
 
 CANDIDATES, SLOTS = "candidates", "slots"
 ACTIONS = (CANDIDATES, SLOTS)  # What an action is: the candidate or the slot that goes
-INFOS = ("full", "summary", "mask", "none")
+INFOS = ("full", "summary", "mask")
 RENDER_MODES = ("ansi", "rgb_array", "human")
-MASK_KEYS = {
-    "rllib": ("observations", "action_mask"),
-    "tianshou": ("obs", "mask"),
-    "pettingzoo": ("observation", "action_mask"),
-}
-"""Library -> its keys of the observation and of the action mask in it."""
-
-_CHOICES = {"info": INFOS, "render_mode": (*RENDER_MODES, None), "mask_dtype": ("int8", "bool")}
+_CHOICES = {"info": INFOS, "observation": ("dict", "flat", None), "render_mode": (*RENDER_MODES, None)}
 
 
 class InvalidActionError(BufgymError, gym.error.InvalidAction):
@@ -56,10 +48,6 @@ class Options:
     """A term's name, or weights by name; terms outside ``REWARD_TERMS`` take part only if named."""
     reference: str | Policy = "min-motion-gap"
     """The rule of ``paired``, a compiled policy or its name; "min-motion-gap" always drops the cheapest."""
-    reward_scale: float | str | None = None
-    """Factor on the reward, None for 1. "episode" is the constant ``reward_scale`` of the scenario's class, which
-    brings a rule's return in a default episode between 1 and 10; weights of your own terms stay as they are.
-    ``info["reward_terms"]`` is not scaled."""
     actions: str = CANDIDATES
     """What an action is: "candidates", for one queue, or "slots", the only one of several topics."""
     candidates: int = 2
@@ -67,30 +55,20 @@ class Options:
     repeat: int = 1
     """An action holds for so many decisions. At each of them its place in the order of candidates is looked up anew.
     Rewards add up over them, and an episode's end cuts them short. For candidates."""
-    fields: str | Sequence[str] | None = None
+    fields: Sequence[str] | None = None
     """With candidates, names of fields to observe beside the 27 numbers, your own or those of ``ON_BOARD_FIELDS``. With
-    slots, names of the fields to observe, by default all of the tables; "compact" means all of the context's."""
+    slots, names of all fields to observe, by default those of the tables."""
     observation: str | None = None
-    """Form: "flat", the default of candidates; "dict", the default of slots; or "slots"."""
+    """Form: "flat", the default of candidates, or "dict", the default of slots."""
     info: str = "full"
     """How much ``info`` has: "full"; "summary" adds the summary so far in every step, for recorders; "mask" has the
-    mask alone, and at an episode's end its summary; "none" has only this summary."""
+    mask and the candidates' slots alone, and at an episode's end its summary."""
     bound: bool = False
     """Whether the last ``info`` also has ``clairvoyant``, ``certified``, ``regret`` and ``score``, for one queue."""
-    pool: int | None = None
-    """Take every episode from a fixed set of so many, a ``bufgym.scenario.numbered.Pool`` that is the same for every
-    seed; None to draw a new one at each reset."""
     num_threads: int = 1
     """Threads that share the environments of a batch; they do not change results."""
     render_mode: str | None = None
     """Drawing: "ansi", "rgb_array", or "human" for a window that shows each step (extra ``human``)."""
-    mask_in_observation: bool | str | Sequence[str] = False
-    """Whether observations hold the action mask. True puts ``action_mask`` beside the fields. Two names, or the library
-    they belong to, make a nested dict: "rllib" (``observations``, ``action_mask``), "tianshou" (``obs``, ``mask``),
-    "pettingzoo" (``observation``, ``action_mask``). A "flat" observation is always nested, by True as by "pettingzoo".
-    """
-    mask_dtype: str = "int8"
-    """Type "int8" or "bool" of the mask in observations; in ``info`` it is int8, which Gymnasium samples by."""
 
     def __post_init__(self) -> None:
         for name, known in _CHOICES.items():
@@ -102,12 +80,10 @@ class Options:
         whole("repeat", self.repeat, 1)
         if self.repeat > 1 and not self.acts_on_candidates:
             raise BufgymError(f"repeat = {self.repeat}: for candidates, whose order an action keeps; not for slots")
-        if self.acts_on_candidates and self.fields == "compact":
-            raise BufgymError(f"fields = 'compact': is for actions = 'slots'; {CANDIDATES!r} have fields of their own")
-        names: Any = () if self.fields in (None, "compact") else self.fields
+        names: Any = () if self.fields is None else self.fields
         is_list = isinstance(names, Collection) and not isinstance(names, str)
         if not (is_list and all(isinstance(name, str) for name in names)):
-            raise BufgymError(f"fields = {names!r}: must be a list of names or 'compact'")
+            raise BufgymError(f"fields = {names!r}: must be a list of names")
         flag("bound", self.bound)
         whole("num_threads", self.num_threads, 1)
 
@@ -138,35 +114,6 @@ class Options:
     def shows_all(self) -> bool:
         """Whether ``info`` has all entries in every step."""
         return self.info in ("full", "summary")
-
-    @property
-    def shows_mask(self) -> bool:
-        """Whether ``info`` has the action mask in every step."""
-        return self.info != "none"
-
-    @property
-    def mask_keys(self) -> MaskKeys | None:
-        """Keys of an observation that holds the action mask; None if it does not."""
-        asked = self.mask_in_observation
-        if isinstance(asked, bool):
-            beside = None if self.form != "flat" else "observation"
-            return MaskKeys(beside, "action_mask", self.mask_dtype) if asked else None
-        keys = MASK_KEYS.get(asked) if isinstance(asked, str) else asked
-        if not isinstance(keys, Sequence) or len({key for key in keys if isinstance(key, str)}) != 2 or len(keys) != 2:
-            rule = f"must be True, False, two names of keys or one of {', '.join(map(repr, MASK_KEYS))}"
-            raise BufgymError(f"mask_in_observation = {asked!r}: {rule}")
-        return MaskKeys(keys[0], keys[1], self.mask_dtype)
-
-    def reward_factor(self, scenario: Any) -> float:
-        """Factor on the reward: a number as given, or for "episode" the ``reward_scale`` of the scenario's class."""
-        if (given := self.reward_scale) is None:
-            return 1.0
-        if isinstance(given, str) and given == "episode":
-            given = getattr(getattr(scenario, "uplink", scenario), "reward_scale", None)  # a fleet's is its uplink's
-            if given is None:
-                raise BufgymError("reward_scale = 'episode': this scenario has no `reward_scale`; give a number")
-        above_0("reward_scale", given, ", 'episode' or None")
-        return float(given)
 
     def check_without_own_link(self, what: str) -> None:
         """Refuse options for one queue on a link of its own where the sender has ``what`` instead."""

@@ -1,4 +1,4 @@
-"""Your own observation fields and reward terms, computed beside the built-in ones where an environment names them.
+"""What is computed beside the kernel of a step: your own observation fields and reward terms, and ``regret``.
 
 Compiled functions are values of one function type, as policies are, so these kernels are compiled once for all of them.
 Other functions run in ordinary Python. Row i of a batch and the single environment call the same function.
@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 
 from bufgym.envs.observation import ObservationForm, Place
 from bufgym.envs.output import StepOutput
+from bufgym.envs.reward import APART
 from bufgym.jit import compile_signature, kernel, named, unchecked_at, unchecked_slice
 from bufgym.kernels.kinds import BOOL, FLOAT, INT, KernelError, Pointer, Tuple, array_kind, record_kind
 from bufgym.model.buffer import MESSAGE, TOPIC, Buffer
 from bufgym.model.documented import documented
 from bufgym.model.observe import Field, OwnTerm
+from bufgym.oracle.hindsight import Hindsight
 from bufgym.policies.registry import view_kind
+from bufgym.sim import Senders
 from bufgym.sim.rollout import python_arrival, python_view
 from bufgym.sim.state import ARRIVAL_WAITS, LOG_ENTRY, NOTHING_WAITS, Batch
 from bufgym.sim.view import last_arrival, view
@@ -219,6 +222,68 @@ class OwnTerms:
         self._marks[:, TRANSMITTED], self._marks[:, CREDITED] = senders["transmitted"], senders["credited"]
         self._marks[:, DROPS] = senders["rejected"] + senders["evicted"]
         self._marks[:, UNTIL] = senders["now_us"]
+
+
+class Regret:
+    """The reward ``regret``, in column ``column``: how much of the best attainable H each decision gives up.
+
+    Let V* be the best H that can still be reached from a state by somebody who knows the whole link and workload. The
+    reward of a step is the change of V*, and at the end H takes its place. V*(start) is the clairvoyant's H of the
+    episode; what is lost before the first decision counts in the first step. So the rewards of an episode sum to
+    H - V*(start), and the best policy is the same as under ``retained``: this is reward shaping by a potential
+    [ng1999policy]. The luck of link and motion is taken out of the reward. Only the reward sees the future:
+    observations and evaluations do not.
+    """
+
+    def __init__(self, senders: Senders, column: int) -> None:
+        self._hindsight, self._column = Hindsight(senders, "reward = 'regret'"), column
+        self._most = np.zeros(len(senders))
+        self._every = np.arange(len(senders))
+
+    def begin(self, rows: NDArray[np.int64]) -> None:
+        """Note V* of the episodes that these ``rows`` have loaded and not begun to play."""
+        self._most[rows] = self._hindsight.at_start(rows)[rows]
+
+    def write(self, output: StepOutput) -> None:
+        """Write the change of V* in the step that all rows have just taken."""
+        now = np.where(output.terminated, output.qoi, self._hindsight.most(self._every))
+        output.reward_terms[:, self._column] = now - self._most
+        self._most = now
+
+
+class Beside:
+    """What a step computes in Python when its kernel is done: ``regret``, and fields and terms of your own.
+
+    ``sums`` says whether the reward has such a term, which the kernel's sum lacks; ``has_any``, whether there is any
+    field or term to ``begin`` and ``write``.
+    """
+
+    def __init__(self, senders: Senders, form: ObservationForm, own: Sequence[OwnTerm], names: Sequence[str]) -> None:
+        """``own`` are the named terms that are in no table; ``names`` are those of all terms, by column."""
+        of_steps = [term for term in own if term.name not in APART]
+        self._senders = senders
+        self._terms = OwnTerms(of_steps, len(names) - len(own), len(senders))
+        self._regret = Regret(senders, names.index("regret")) if "regret" in names else None
+        self._fields = OwnFields(form)
+        self.sums = bool(of_steps) or self._regret is not None
+        self.has_any = self.sums or bool(form.own_places)
+
+    def load(self, rows: NDArray[np.int64]) -> None:
+        """See the episodes that these ``rows`` have loaded and not begun to play."""
+        if self._regret is not None:
+            self._regret.begin(rows)
+
+    def begin(self, rows: NDArray[np.int64], output: StepOutput) -> None:
+        """Begin an episode in these rows, at their first decision."""
+        self._terms.begin(self._senders.batch, rows)
+        self._fields.write(self._senders.batch, output)
+
+    def write(self, output: StepOutput) -> None:
+        """Write the terms of the step that all rows have just taken, and the fields they observe now."""
+        self._terms.write(self._senders.batch, output)
+        if self._regret is not None:
+            self._regret.write(output)
+        self._fields.write(self._senders.batch, output)
 
 
 _python_step_of: Any = getattr(step_of, "py_func", step_of)

@@ -33,8 +33,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
 
     **Observation** 27 numbers, float32: six of each candidate and nine of the queue (``CANDIDATE_FIELDS`` and
     ``QUEUE_FIELDS`` of ``bufgym.model.observe``). Most are logarithms of ratios in [-3, 3], so they mean the same at
-    every L, frame rate and size. ``observation="dict"`` gives an array for each field. "slots" gives ``slots``
-    [candidates, candidate fields] and ``context`` [queue fields].
+    every L, frame rate and size. ``observation="dict"`` gives an array for each field.
 
     **Reward** ``retained`` by default, which charges a drop at once and adds up to H - 1 over an episode, or to 0 if
     nothing was delivered. Other terms, or weights of several, go by name: ``bufgym.model.observe.REWARD_TERMS`` and

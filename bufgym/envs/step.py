@@ -9,16 +9,24 @@ as both run the same code.
 import numpy as np
 from numpy.typing import NDArray
 
-from bufgym.envs.candidates import Choices, candidate_decision, renew_candidates, write_candidates
 from bufgym.envs.cost import Charged, Rival, write_cost, write_paired
-from bufgym.envs.output import StepOutput, decision_of, settle_gains, write_named, write_observation, write_rewards
-from bufgym.jit import kernel, prefetch
-from bufgym.model.buffer import HOLD
-from bufgym.model.observe import Chosen
-from bufgym.sim.decisions import answer_send, decide
+from bufgym.envs.output import (
+    Choices,
+    StepOutput,
+    settle_gains,
+    write_candidates,
+    write_named,
+    write_observation,
+    write_rewards,
+)
+from bufgym.jit import kernel, prefetch, unchecked_slice
+from bufgym.model.buffer import ACCEPT, HOLD, REJECT
+from bufgym.model.observe import Chosen, decision_of_candidate, find_candidates
+from bufgym.sim.decisions import answer_send, decide, has_room
 from bufgym.sim.shared_link import Shares, next_in_cell
 from bufgym.sim.state import ARRIVAL_WAITS, DECISION, DEPARTURE, END, NOTHING_WAITS, SOCKET_WAITS, Batch
 from bufgym.sim.transition import next_event, offer
+from bufgym.sim.view import arrival_of, view
 
 _AHEAD = 8
 """Rows to prefetch ahead: far enough for memory to answer in time, near enough for the answer to be in cache still."""
@@ -31,6 +39,31 @@ def advance(batch: Batch, i: int) -> None:
     while event == DEPARTURE:
         event = next_event(batch, None, i)
     settle_gains(batch, i, event == END)
+
+
+@kernel
+def candidate_decision(batch: Batch, i: int, action: int, choices: Choices) -> int:
+    """The decision that an action of row ``i`` stands for."""
+    order = unchecked_slice(choices.order, i, 0, choices.order.shape[1])
+    return decision_of_candidate(
+        order, batch.senders[i].occupancy, choices.at_arrivals == 1, has_room(batch, i), action
+    )
+
+
+@kernel
+def renew_candidates(batch: Batch, i: int, choices: Choices) -> None:
+    """Find the candidates of row ``i`` where a decision is due that is not shown."""
+    places = choices.order.shape[1]
+    order, cost = unchecked_slice(choices.order, i, 0, places), unchecked_slice(choices.cost, i, 0, places)
+    find_candidates(view(batch, i), arrival_of(batch, i), order, cost)
+
+
+@kernel
+def decision_of(action: int, capacity: int) -> int:
+    """The decision for an action: 0..L-1 evict that slot, L reject, L + 1 accept."""
+    if action < capacity:
+        return action
+    return REJECT if action == capacity else ACCEPT
 
 
 @kernel

@@ -13,14 +13,12 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from bufgym.envs.candidates import new_choices
 from bufgym.envs.cost import Charges
-from bufgym.envs.observation import Handed, Observation, ObservationForm
+from bufgym.envs.observation import Observation, ObservationForm
 from bufgym.envs.options import InvalidActionError, Options
-from bufgym.envs.output import StepOutput
-from bufgym.envs.own import OwnFields, OwnTerms
-from bufgym.envs.regret import Regret
-from bufgym.envs.reward import APART, reward_weights
+from bufgym.envs.output import BufferPool, StepOutput, new_choices
+from bufgym.envs.own import Beside
+from bufgym.envs.reward import reward_weights
 from bufgym.envs.step import step_rows
 from bufgym.jit import Repeated
 from bufgym.model.observe import (
@@ -36,7 +34,7 @@ from bufgym.model.observe import (
 )
 from bufgym.oracle.measure import MEASURED, measured
 from bufgym.scenario import Scenario, Streams
-from bufgym.scenario.numbered import Pool, numbered
+from bufgym.scenario.numbered import numbered
 from bufgym.sim import Senders
 from bufgym.sim.senders import Begun
 from bufgym.utils.errors import BufgymError, unknown
@@ -72,7 +70,7 @@ class SubEnvs:
         if several_topics:
             options.check_without_own_queue("several topics")
         self.scenario, self.options = scenario, options
-        self._shows_all, self._shows_mask = options.shows_all, options.shows_mask
+        self._shows_all = options.shows_all
         self._adds_summary = options.info == "summary"
         self.senders = Senders(
             n,
@@ -85,9 +83,6 @@ class SubEnvs:
         )
         self.capacity = self.senders.capacity
         self.streams: list[Streams | None] = [None] * n
-        self._draw: Callable[[Streams], Any] = scenario.draw
-        if options.pool is not None:
-            self._draw = Pool(scenario.draw, options.pool)
         self._threads = Threads(np.arange(n), options.num_threads)
         self._again = [Repeated() for _ in self._threads.parts]
         self._begin = Repeated()
@@ -103,20 +98,14 @@ class SubEnvs:
 
         self.weights, own_terms = reward_weights(options.reward, several_topics)
         self.terms = terms_for(several_topics) + own_terms
-        scaled = len(self.terms) - len(own_terms) if options.reward_scale == "episode" else None
-        self.weights[:scaled] *= options.reward_factor(scenario)
         self._term_names = names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(names)))
-        of_steps = tuple(term for term in own_terms if term.name not in APART)
-        self._own_terms = OwnTerms(of_steps, len(names) - len(own_terms), n)
-        self._regret = Regret(self.senders, names.index("regret")) if "regret" in names else None
         self._charges = Charges(self.senders, names, options.reference)
 
         self.form = self._observed()
-        self.observation_space, self._handed = self.form.space, Handed(self.form)
-        self._own_fields = OwnFields(self.form)
-        self._sums_here = bool(of_steps) or self._regret is not None
-        self._has_own = self._sums_here or bool(self.form.own_places)
+        self.observation_space = self.form.space
+        self._rows = None if self.form.form == "flat" else BufferPool(self._new_row)
+        self._beside = Beside(self.senders, self.form, own_terms, names)
         self.output = self.new_output()
 
     def _observed(self) -> ObservationForm:
@@ -127,21 +116,20 @@ class SubEnvs:
         options, several_topics = self.options, bool(self.scenario.topics)
         if self.choices is not None:
             return ObservationForm(
-                options.form, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields, options.mask_keys,
-                candidates=options.candidates, actions=self.actions_count,
+                options.form, CANDIDATE_FIELDS, QUEUE_FIELDS, self.capacity, options.fields,
+                candidates=options.candidates,
             )  # fmt: skip
         slot_fields = SLOT_FIELDS + (TOPIC_SLOT_FIELDS if several_topics else ())
         context_fields = CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if several_topics else ())
-        names = [field.name for field in context_fields]
-        chosen = names if isinstance(options.fields, str) and options.fields == "compact" else options.fields
-        beside = [*names, *(name for name in BUILT_IN if name not in (field.name for field in slot_fields))]
+        chosen = options.fields
+        slots, context = ({field.name for field in fields} for fields in (slot_fields, context_fields))
+        beside = context | ({*BUILT_IN} - slots)
         only_chosen = chosen is not None and not several_topics and not self.keeps_slots
         if several_topics and not self.keeps_slots and chosen and all(n in beside or own_field(n) for n in chosen):
             slot_fields = ()
         return ObservationForm(
-            options.form, slot_fields, context_fields, self.capacity, chosen, options.mask_keys,
-            only_chosen=only_chosen,
-        )  # fmt: skip
+            options.form, slot_fields, context_fields, self.capacity, chosen, only_chosen=only_chosen
+        )
 
     def __len__(self) -> int:
         return len(self.senders)
@@ -179,15 +167,13 @@ class SubEnvs:
     def reset(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None = None) -> None:
         """Begin a new episode in each of ``rows``: the given one, or the next of its streams where that is None."""
         loaded = self._load(rows, episodes)
-        if self._regret is not None:
-            self._regret.begin(rows)
+        self._beside.load(rows)
         if (same := self._begun.get(len(loaded))) is None:  # a call is repeated with the same arrays
             same = self._begun[len(loaded)] = np.empty_like(loaded)
         same[:] = loaded
         self._run(self._begin, same, NO_ACTIONS)
-        if self._has_own:
-            self._own_terms.begin(self.senders.batch, rows)
-            self._own_fields.write(self.senders.batch, self.output)
+        if self._beside.has_any:
+            self._beside.begin(rows, self.output)
 
     def step(self, actions: NDArray[np.int64]) -> None:
         """Take one decision in every sub-environment; the result is in ``self.output``."""
@@ -196,11 +182,8 @@ class SubEnvs:
             self._run(self._again[0], self._threads.parts[0], self._actions)
         else:
             self._threads.each(lambda part, rows: self._run(self._again[part], rows, self._actions))
-        if self._has_own:
-            self._own_terms.write(self.senders.batch, self.output)
-            if self._regret is not None:
-                self._regret.write(self.output)
-            self._own_fields.write(self.senders.batch, self.output)
+        if self._beside.has_any:
+            self._beside.write(self.output)
 
     def _load(self, rows: NDArray[np.int64], episodes: Sequence[Any] | None) -> NDArray[np.int64]:
         """Load ``episodes[i]`` into each of ``rows``; return what ``_run`` is to step.
@@ -236,7 +219,7 @@ class SubEnvs:
     def rewards(self) -> NDArray[np.float64]:
         """float64[n]: the weighted sum of the reward terms of the last step, in an array of ``output``."""
         rewards = self.output.rewards
-        if self._sums_here:
+        if self._beside.sums:
             rewards[:] = 0.0
             # Term by term, as the kernels add them: a matrix product may round differently.
             for weight, terms in zip(self.weights, self.output.reward_terms.T, strict=True):
@@ -256,8 +239,8 @@ class SubEnvs:
 
     def info(self, i: int, ended: bool) -> dict[str, Any]:
         """Gymnasium's info of sub-environment ``i`` after a reset or a step; see ``Options.info``."""
-        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()} if self._shows_mask else {}
-        if self.choices is not None and self._shows_mask:
+        info: dict[str, Any] = {"action_mask": self.output.action_mask[i].copy()}
+        if self.choices is not None:
             info["slots"] = self.output.slot_actions[i].copy()
         if not (self._shows_all or ended):
             return info
@@ -274,9 +257,19 @@ class SubEnvs:
     def observation(self, i: int | None = None) -> Observation:
         """The present observation of all, as views of ``output``; of sub-environment ``i`` alone, as a copy."""
         if i is None:
-            return self.form.masked(self.form.of(self.output.flat), self.output.action_mask)
-        observation = self._handed.of(self.output.flat[i])
-        return self.form.masked(observation, self.output.action_mask[i].copy()) if self.form.mask else observation
+            return self.form.of(self.output.flat)
+        row = self.output.flat[i]
+        if self._rows is None:
+            return row.copy() if self.form.is_row else self.form.of(row)
+        numbers, views = self._rows.take()
+        numbers[:] = row
+        return views.copy()
+
+    def _new_row(self) -> Any:
+        """A row of numbers and its views, for a pool: making a dict of twenty views costs more than a step."""
+        numbers = np.empty(self.form.numbers, np.float32)
+        views = self.form.of(numbers)
+        return (numbers, views), [numbers, *views.values()]
 
     def action(self, name: str, action: Any) -> int:
         """``action`` as an int; the error for a bad action calls it ``name``."""
@@ -343,4 +336,4 @@ class SubEnvs:
         if (streams := self.streams[i]) is None:
             self.seed(i, seeding.np_random()[0])
             return self._next_episode(i)
-        return self._draw(streams), streams.policy
+        return self.scenario.draw(streams), streams.policy

@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from bufgym.envs.observation import BufferPool, Observation
+from bufgym.envs.observation import Observation
 from bufgym.envs.options import RENDER_MODES, Options, read_arguments
+from bufgym.envs.output import BufferPool
 from bufgym.envs.sub_envs import SubEnvs, check_entries
 from bufgym.model.checks import whole
 from bufgym.scenario import Scenario
@@ -213,21 +214,22 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
 
     def _observed(self) -> Observation:
         """The present observation; a dict of its own each time."""
-        if not self._views:
+        if self._seen is None:  # chosen numbers of each row, which are a copy
             return self.sub_envs.observation()
-        return self.sub_envs.form.masked(self._views.copy(), self.sub_envs.output.action_mask)
+        return self._seen.copy() if isinstance(self._seen, dict) else self._seen
 
     def _new_buffers(self) -> Any:
-        """(New arrays for a step, the views that are its observation, its info), and all these arrays."""
+        """(New arrays for a step, what of them is its observation, its info), and all these arrays."""
         sub_envs, output = self.sub_envs, self.sub_envs.new_output()
-        shown: dict[str, Any] = {"action_mask": output.action_mask} if sub_envs.options.shows_mask else {}
-        if sub_envs.choices is not None and sub_envs.options.shows_mask:
+        shown: dict[str, Any] = {"action_mask": output.action_mask}
+        if sub_envs.choices is not None:
             shown["slots"] = output.slot_actions
         terms = {term.name: output.reward_terms[:, k] for k, term in enumerate(sub_envs.terms)}
         if sub_envs.options.shows_all:
             shown |= {"qoi": output.qoi, "invalid": output.invalid, "reward_terms": self._marked(terms)}
-        views = sub_envs.form.of(output.flat) if sub_envs.form.is_view else {}
-        return (output, views, self._marked(shown)), [*output, *views.values(), *terms.values()]
+        seen = sub_envs.form.of(output.flat) if sub_envs.form.is_row or sub_envs.form.form == "dict" else None
+        views = seen.values() if isinstance(seen, dict) else ()
+        return (output, seen, self._marked(shown)), [*output, *views, *terms.values()]
 
     def _marked(self, columns: dict[str, Any]) -> dict[str, Any]:
         """``columns`` with Gymnasium's marks: every environment has each of them."""
@@ -248,7 +250,7 @@ class SenderVectorEnv(VectorEnv[Observation, NDArray[np.int64], NDArray[Any]]):
     def _renew_output(self, keep: bool = False) -> None:
         """Let the next step write into arrays that nobody outside holds; ``keep`` copies the last step's results."""
         sub_envs, before = self.sub_envs, self.sub_envs.output
-        sub_envs.output, self._views, self._shown = self._buffers.take()
+        sub_envs.output, self._seen, self._shown = self._buffers.take()
         if keep and sub_envs.output is not before:
             for new, old in zip(cast(Any, sub_envs.output), before, strict=True):
                 new[...] = old

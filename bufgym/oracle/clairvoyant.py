@@ -164,7 +164,7 @@ def integer_plan(episode: Episode, capacity: int, max_bytes: int, v: Value) -> F
     even = (arrivals["x"] == np.arange(T + 2)).all() and (arrivals["size_bytes"] == size).all()
     if not (stands and even and (episode.first_decision, episode.last_decision) == (1, T)):
         raise BufgymError(
-            "policy oracle: it plans for one interruption (--interruption, interruption-v1), not for this"
+            "policy oracle: it plans for one interruption (scenario interruption, suite interruption-v1), not for this"
         )
     kept = np.zeros(T + 2)
     kept[evenly_kept(min(capacity, max_bytes // size), T)] = 1.0

@@ -48,8 +48,6 @@ def _observes(space: Any, candidates: int) -> bool:
     fields = fields_of(space)
     if fields is not None:
         return fields.get(_FIRST) == candidates + 1
-    if isinstance(space, spaces.Dict):
-        return "slots" in set(space) and space["slots"].shape == (candidates + 1, len(CANDIDATE_FIELDS))
     return bool(space == _form("flat", candidates).space)
 
 

@@ -81,8 +81,6 @@ class _Decisions:
             rule = "must be Discrete(L + 2), or that of candidates"
             raise BufgymError(f"model {name}: action space {actions}: {rule}")
         form = "dict" if isinstance(space, spaces.Dict) else "flat"
-        if form == "dict" and {"slots", "context"} & set(space):
-            form = "slots"
         fields, numbers = fields_of(space), spaces.flatdim(space)
         names = None if fields is None else list(fields)
         all_fields = (

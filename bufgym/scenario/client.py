@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,7 +110,6 @@ class Client:
     value: Value = field(default_factory=lambda: qoi.exponential(0.618))
     """V of topics that have none of their own."""
 
-    reward_scale: ClassVar[float] = 0.0005
     """Factor on rewards that brings a default episode's return between 1 and 10."""
 
     def __post_init__(self) -> None:
@@ -259,7 +258,7 @@ def read_client(path: str | Path, **parameters: Any) -> Client:
 
     A topic's ``value`` has the form of the command line (``"exponential:0.618"``). Its sizes in other encodings look
     like ``encodings = {json = 28000}``. ``parameters`` add settings that the file lacks, such as ``traces`` and
-    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions, as in ``bufgym topics --config``.
+    ``motion``. Without ``traces`` the client gets the shipped LTE links and motions.
 
     Raises BufgymError, one line that names the file, for a file that can't be read or breaks a rule.
     """

@@ -54,7 +54,6 @@ class Interruption:
 
     topics: ClassVar[tuple[Topic, ...]] = ()
     """Empty: one queue."""
-    reward_scale: ClassVar[float] = 1.0
     """Factor on rewards that brings a default episode's return between 1 and 10."""
 
     def __post_init__(self) -> None:

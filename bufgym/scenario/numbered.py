@@ -1,10 +1,7 @@
-"""Episodes by seed, the same in a row of a benchmark and in the reset of an environment; and from a fixed pool."""
+"""Episodes by seed, the same in a row of a benchmark and in the reset of an environment."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from bufgym.model.checks import whole
 from bufgym.scenario.episode import Streams
@@ -85,28 +82,3 @@ def _part(scenario: Any, trace: str | int | None) -> Any:
     if not isinstance(trace, int) or not 0 <= trace < len(parts):
         raise BufgymError(f"trace = {trace!r}: must be 0..{len(parts) - 1} or one of {', '.join(labels)}")
     return parts[trace][1]
-
-
-MAX_EPISODES = 10**6
-_SEED = 704_251  # A seed that people do not use, so that rows of a benchmark differ from the episodes of a pool
-
-
-class Pool:
-    """``episodes`` episodes that ``draw`` draws, the same for everyone who makes a pool of it.
-
-    Called with a row's streams, as ``draw`` is, it returns one of them at random. An episode is drawn at its first use
-    and then stays in memory, 56 bytes a message.
-    """
-
-    def __init__(self, draw: Callable[[Streams], Any], episodes: int) -> None:
-        self._draw = draw
-        self._episodes: list[Any] = [None] * whole("pool", episodes, 1, MAX_EPISODES)
-
-    def __len__(self) -> int:
-        return len(self._episodes)
-
-    def __call__(self, streams: Streams) -> Any:
-        number = int(streams.link.integers(len(self)))
-        if self._episodes[number] is None:
-            self._episodes[number] = self._draw(Streams.seeded(np.random.SeedSequence([_SEED, number])))
-        return self._episodes[number]

@@ -81,7 +81,6 @@ class Uplink:
 
     topics: ClassVar[tuple[Topic, ...]] = ()
     """Empty: one queue."""
-    reward_scale: ClassVar[float] = 0.1
     """Factor on rewards that brings a default episode's return between 1 and 10."""
 
     def __post_init__(self) -> None:

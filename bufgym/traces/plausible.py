@@ -192,7 +192,8 @@ def doubt_of_noise(shares: dict[int, float], x: float) -> str:
     which = "second" if k == 2 else f"{k}th"
     return (
         f"x of every {which} pose is {shares[k]:.2f} of x (real motion 0.88 and more, noise 1/{k}): about {noise:.0%} "
-        f"of x = {x:.3f} is noise of the positions, or hops between two sources (--rate-hz compares poses less often)"
+        f"of x = {x:.3f} is noise of the positions, or hops between two sources (from-bag --rate-hz compares poses "
+        "less often)"
     )
 
 

@@ -28,17 +28,23 @@ def is_named(text: str) -> bool:
     return _NAMED.fullmatch(text) is not None
 
 
-def find(text: str, folder: str | None = None) -> Any:
+def find(text: str, folder: str | None = None, also: str = "") -> Any:
     """The object named by ``module:function``; ``folder`` (by default the current one) is searched for the module too.
 
     Raises:
-        BufgymError: no such module or function.
+        BufgymError: no such module or function; the message mentions ``also``, another reading of the text.
     """
     module, _, name = text.partition(":")
-    found = getattr(imported(text, folder or os.getcwd()), name, None)
+    found = getattr(imported(text, folder or os.getcwd(), also), name, None)
     if found is None:
         raise BufgymError(f"{text}: the module {module} has no {name}")
     return found
+
+
+def made(text: str, folder: str, also: str = "") -> Any:
+    """The object named by ``module:function``, or what it makes if it is a function without arguments; see ``find``."""
+    found = find(text, folder, also)
+    return found() if callable(found) and needs(found) == 0 else found
 
 
 def imported(text: str, folder: str, also: str = "") -> Any:

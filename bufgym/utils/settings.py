@@ -10,9 +10,11 @@ from bufgym.utils.errors import BufgymError
 def named_settings(what: str, text: str, read: Callable[[str], Any] = float) -> tuple[str, dict[str, Any]]:
     """Split into the name and its settings, each value as ``read`` makes it; ``what`` is the thing, for the message.
 
-    A comma begins the next setting only before ``parameter=``, so a value may hold commas.
+    A comma begins the next setting only before ``parameter=``, so a value may hold commas. A name may hold a colon, as
+    in ``"module:function:robots=3"``.
     """
-    name, _, settings = text.partition(":")
+    split = re.match(r"([^=]*?):(?=\s*[A-Za-z_]\w*\s*=)", text)
+    name, settings = (split[1], text[split.end() :]) if split else (text.partition(":")[0], text.partition(":")[2])
     found: dict[str, Any] = {}
     for setting in filter(None, re.split(r",(?=\s*[A-Za-z_]\w*=)", settings)):
         key, _, value = setting.partition("=")

@@ -27,7 +27,7 @@ print({agent: round(info["qoi"], 2) for agent, info in infos.items()})
 # %% [markdown]
 # ## Policies on every robot
 #
-# `bufgym fleet --suite fleet-v1` runs policies on 16 robots. Here are three of them on a cell of eight.
+# `bufgym bench --suite fleet-v1` runs policies on 16 robots. Here are three of them on a cell of eight.
 
 # %%
 import bufgym

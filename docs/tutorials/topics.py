@@ -26,7 +26,7 @@ for name in names:  # a row for each topic of a run; the run's weighted sum is i
     print(f"{name:18} H = {sum(h) / len(h):7.1f}")
 
 # %% [markdown]
-# The same on the command line, with your own client in TOML: `bufgym topics --config examples/client.toml`.
+# The same on the command line, with your own client in TOML: `bufgym bench --scenario examples/client.toml`.
 #
 # ## Who is heard?
 #

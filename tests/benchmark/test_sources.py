@@ -53,7 +53,7 @@ number = 3
 """
 LINES = MODULE.split("\n")
 SHIPPED = Path(policies.__file__).parents[2] / "agents" / "pretrained" / "learned.safetensors"
-ONE = ["--interruption", "--law", "fixed", "--t-max", "12", "--capacity", "3", "--seeds", "1"]
+ONE = ["--scenario", "interruption:law=fixed,t_max=12", "--capacity", "3", "--seeds", "1"]
 
 
 @pytest.fixture

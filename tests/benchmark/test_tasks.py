@@ -230,11 +230,10 @@ test_rows_that_cannot_be_summed_up = refused(
 @pytest.mark.nightly
 def test_the_command_prints_a_table_and_writes_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rows.csv"
-    options = "--robots 2 --seeds 1 --capacity 3 --split validation --policies drop-oldest,min-gap --jobs 1"
-    text = shown(["fleet", *options.split(), "--out", out], capsys)
-    assert "6 episodes of 60 s on 6 links, 2 robots in a cell." in text
-    assert "Not the suite as it is: robots = 2." in text
-    assert ", L = 3\n" in text and "mean of these" not in text and f"36 rows in {out}" in text
+    options = "--seeds 1 --capacity 3 --split validation --policies drop-oldest,min-gap --jobs 1"
+    text = shown(["bench", "--suite", "fleet-v1", *options.split(), "--out", out], capsys)
+    assert "6 episodes of 60 s on 6 links, 16 robots in a cell." in text
+    assert ", L = 3\n" in text and "mean of these" not in text and f"288 rows in {out}" in text
     rows = read_rows(out, FLEET_ROWS)
-    assert len(rows) == 6 * 2 * 3 and {row["policy"] for row in rows} == {"drop-oldest", "min-gap", "afr"}
-    assert table_of(FLEET.summary(rows)).plain().splitlines()[3:] == text.splitlines()[7:10]
+    assert len(rows) == 6 * 16 * 3 and {row["policy"] for row in rows} == {"drop-oldest", "min-gap", "afr"}
+    assert table_of(FLEET.summary(rows)).plain().splitlines()[3:] == text.splitlines()[6:9]

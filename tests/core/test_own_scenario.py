@@ -170,7 +170,7 @@ def test_bench_with_a_file_and_with_modules(module: str, capsys: pytest.CaptureF
     shown = capsys.readouterr().out
     assert "over corridor-1, corridor-2" in shown and f"V = {module}:doorways" in shown
     for more, message in (
-        (["--fps", "10"], "--fps cannot go with a scenario of your own"),
+        (["--motion", "none"], "--motion cannot go with nine, which has no such parameter"),
         (["--suite", "lte-v1"], "--scenario-file cannot go with --suite"),
     ):
         assert main([*command, *more]) == 2

@@ -222,7 +222,7 @@ def test_a_rule_plays_among_candidates() -> None:
 
 test_wrong_use_is_named = [
     (lambda: SenderEnv("lte", candidates=0), "candidates = 0: must be a whole number from 1 to 64"),
-    (lambda: SenderEnv("lte", fields="compact"), "fields = 'compact': is for actions = 'slots'"),
+    (lambda: SenderEnv("lte", fields="rank"), "fields = 'rank': must be a list of names"),
     (lambda: gym.make("bufgym/Topics-v0", actions="candidates"), "known for one queue on a link of its own"),
     (lambda: SenderEnv("lte", size_cv=0.5, reward="regret").reset(seed=0), "for equal sizes only"),
     (lambda: _begun().step(3), r"must be a whole number in 0\.\.2 \(the 2 cheapest candidates and the head\)"),

@@ -8,7 +8,7 @@ from env_cases import SMALL
 
 from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.model.link import Link
-from bufgym.model.observe import BUILT_IN, CANDIDATE_FIELDS, FIELDS, QUEUE_FIELDS, field
+from bufgym.model.observe import BUILT_IN, CANDIDATE_FIELDS, QUEUE_FIELDS, field
 from bufgym.scenario import Episode, messages
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
@@ -72,15 +72,6 @@ def test_a_flat_row_holds_what_is_named_and_nothing_else() -> None:
     for flat, whole in zip(seen_by(names, "slots", "flat"), seen_by(list(BUILT_IN), "slots"), strict=True):
         assert flat.shape == (N, 4 * (L + 1) + 3)
         np.testing.assert_array_equal(flat, np.concatenate([whole[name] for name in order], axis=1))
-    first = seen_by(names, "slots", "slots", single=True)[0]
-    assert {name: part.shape for name, part in first.items()} == {"slots": (L + 1, 4), "context": (3,)}
-
-
-def test_compact_is_the_context_alone() -> None:
-    for compact, whole in zip(seen_by("compact", "slots"), seen_by(None, "slots"), strict=True):
-        assert list(compact) == [known.name for known in FIELDS if known.per == "context"]
-        for name, numbers in compact.items():
-            np.testing.assert_array_equal(numbers, whole[name], name)
 
 
 def test_named_fields_follow_the_candidates() -> None:
@@ -93,9 +84,6 @@ def test_named_fields_follow_the_candidates() -> None:
         np.testing.assert_array_equal(seen[:, :table], plain)
         named = np.concatenate([whole[name] for name in ("rank", "busy", "rate_long")], axis=1)
         np.testing.assert_array_equal(seen[:, table:], named)
-    first = seen_by(names, "candidates", "slots", single=True)[0]
-    assert first["slots"].shape == (3, len(CANDIDATE_FIELDS))
-    np.testing.assert_array_equal(first["context"], beside[0][0, len(CANDIDATE_FIELDS) * 3 :])
 
 
 @pytest.mark.kernels

@@ -1,7 +1,6 @@
 """Episodes by their numbers in a benchmark or from a pool, suites as environments, their worth, arguments as text."""
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,11 @@ from refusal_cases import refuse, refused
 from bufgym import policies
 from bufgym.benchmark.run import run
 from bufgym.benchmark.sweep import Sweep, run_sweep
-from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
+from bufgym.envs import SenderEnv, SenderVectorEnv
 from bufgym.envs.expert import Player
 from bufgym.model import qoi
 from bufgym.scenario import Interruption, Streams, Uplink, suites
-from bufgym.scenario.numbered import Pool, draw
+from bufgym.scenario.numbered import draw
 from bufgym.traces import Trace, drive_motion, write_csv
 from bufgym.utils.errors import BufgymError
 
@@ -260,47 +259,6 @@ def test_a_randomised_policy_is_random_in_an_environment(env_id: str) -> None:
 
 UPLINK = Uplink(traces=(Trace.steps([(0.4, 9e6), (0.5, 0), (0.6, 2e6)]),), jitter=0.8, duration_s=0.4)
 CAPACITY = 3
-
-
-def test_each_is_drawn_once_and_every_one_comes() -> None:
-    drawn: list[Any] = []
-
-    def draw(streams: Streams) -> Any:
-        drawn.append(UPLINK.draw(streams))
-        return drawn[-1]
-
-    pool, streams = Pool(draw, 5), Streams.seeded(1)
-    taken = Counter(id(pool(streams)) for _ in range(500))
-    assert len(pool) == len(drawn) == len(taken) == 5
-    # Each is taken 100 times of 500 on average; the standard deviation is 9.
-    assert min(taken.values()) > 50
-
-
-def test_the_set_is_the_same_for_every_row_and_seed() -> None:
-    """A single environment, and the rows of a batch, play no other episodes than those of the pool."""
-    arrivals = set()
-    for seed in range(4):
-        batch, single = (
-            SenderVectorEnv(3, UPLINK, CAPACITY, pool=2, actions="slots"),
-            SenderEnv(UPLINK, CAPACITY, pool=2, actions="slots"),
-        )
-        batch.reset(seed=seed)
-        single.reset(seed=seed)
-        played = [*batch.sub_envs.senders.episodes, *single.sub_envs.senders.episodes]
-        arrivals |= {episode.arrivals["arrival_us"].tobytes() for episode in played if episode is not None}
-    assert len(arrivals) == 2
-
-
-def test_fleets_have_one_too() -> None:
-    envs = FleetVecEnv(4, 2, UPLINK, CAPACITY, pool=1)
-    envs.reset(seed=1)
-    links = {(episode.link.trace.name, episode.link.offset_us) for episode in envs.sub_envs.senders.episodes if episode}
-    assert len(links) == 1
-
-
-@pytest.mark.parametrize("pool", [0, -1, 1.5, "many", True])
-def test_a_pool_is_a_whole_number(pool: Any) -> None:
-    refuse(r"pool = .*: must be a whole number from 1 to 1000000", SenderEnv, UPLINK, CAPACITY, pool=pool)
 
 
 def test_a_reset_that_is_refused_touches_no_row() -> None:

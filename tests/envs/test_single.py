@@ -9,16 +9,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from env_cases import DYING, FADING, same
-from gymnasium.utils.env_checker import check_env
 from refusal_cases import refused
 
 from bufgym.envs import SenderEnv
-from bufgym.envs.observation import Handed, ObservationForm
 from bufgym.jit import named
 from bufgym.model import qoi
 from bufgym.model.buffer import UNLIMITED_BYTES, Buffer
 from bufgym.model.link import Link
-from bufgym.model.observe import CONTEXT_FIELDS, FIELDS, SLOT_FIELDS
+from bufgym.model.observe import CONTEXT_FIELDS, FIELDS, TOPIC_CONTEXT_FIELDS
 from bufgym.scenario import Episode, Interruption, Scenario, Uplink, messages
 from bufgym.sim.rollout import python_view
 from bufgym.traces import Trace, drive_motion
@@ -176,8 +174,7 @@ def test_observation_bounds_hold_where_nothing_moves_and_all_comes_at_once() -> 
 
 
 @pytest.mark.parametrize(
-    ("info", "always"),
-    [("full", {"action_mask", "qoi", "invalid", "reward_terms"}), ("mask", {"action_mask"}), ("none", set())],
+    ("info", "always"), [("full", {"action_mask", "qoi", "invalid", "reward_terms"}), ("mask", {"action_mask"})]
 )
 def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     """T = 2, all accepted: the second step delivers 0, 1, 2, 3 and ends the episode."""
@@ -186,30 +183,6 @@ def test_info_is_built_as_far_as_asked(info: str, always: set[str]) -> None:
     last, summary = env.step(5)[4], {"arrived": 4, "delivered": 4, "dropped": 0, "invalid": 0}
     assert last.keys() == always | summary.keys() | {"qoi"}
     assert {name: last[name] for name in summary} == summary and last["qoi"] == pytest.approx(1 + 3 * (1 - 0.618))
-
-
-KEYS = {
-    "rllib": ("observations", "action_mask"),
-    "tianshou": ("obs", "mask"),
-    "pettingzoo": ("observation", "action_mask"),
-}
-
-
-@pytest.mark.parametrize("dtype", ["int8", "bool"])
-@pytest.mark.parametrize("form", ["dict", "flat", "slots"])
-@pytest.mark.parametrize("where", [True, ("seen", "may"), *KEYS])
-def test_observations_hold_the_mask_where_a_library_looks_for_it(where: Any, form: str, dtype: str) -> None:
-    plain, env = make(observation=form), make(observation=form, mask_in_observation=where, mask_dtype=dtype)
-    fields, mask = KEYS.get(where, where) if where is not True else ("observation", "action_mask")
-    (before, _), (seen, info) = plain.reset(seed=2), env.reset(seed=2)
-    for action in range(20):
-        assert env.observation_space.contains(seen) and list(seen) == list(env.observation_space)
-        assert seen[mask].dtype == dtype and seen[mask].tolist() == info["action_mask"].tolist()
-        rest = seen[fields] if fields in seen else {name: seen[name] for name in before}
-        assert same(rest, before) if isinstance(before, dict) else np.array_equal(rest, before)
-        assert (where is True and form != "flat") == (fields not in seen)
-        (before, *_), (seen, _, _, _, info) = plain.step(action % 6), env.step(action % 6)
-    check_env(env, skip_render_check=True)
 
 
 def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
@@ -236,13 +209,8 @@ test_wrong_use_is_named = refused(
     (lambda: SenderEnv(decide_at="noon", actions="slots"), "decide_at = 'noon'"),
     (lambda: SenderEnv(max_bytes=0, actions="slots"), "max_bytes = 0"),
     (lambda: SenderEnv(render_mode="depth_array", actions="slots"), "render_mode = 'depth_array'"),
-    (lambda: SenderEnv(mask_in_observation="tianshu", actions="slots"), "'tianshu': must be True, False, two names"),
-    *(
-        (lambda k=k: SenderEnv(mask_in_observation=("mask", k), actions="slots"), "two names of keys or")
-        for k in ("mask", 1)
-    ),
+    (lambda: SenderEnv(observation="image"), "observation = 'image': must be one of 'dict', 'flat', None"),
     (lambda: SenderEnv(actions="guided"), "unknown actions 'guided'; known: candidates, slots"),
-    (lambda: SenderEnv(mask_dtype="float32", actions="slots"), "mask_dtype = 'float32': must be one of 'int8', 'bool'"),
     *((lambda a=a: begun().step(a), rf"action = .*: {WHOLE}", INVALID) for a in (1.7, np.array([1]), "1", None)),
     (lambda: begun().step(6), r"action = 6: must be a whole number in 0\.\.5", INVALID),
     (lambda: make("interruption").reset(options={"episode": Interruption(t_max=30).episode(30)}), "room for 27"),
@@ -262,38 +230,32 @@ def test_an_episode_that_has_ended_takes_no_step() -> None:
     env.step(0)
 
 
-FORM = ObservationForm("dict", SLOT_FIELDS, CONTEXT_FIELDS, 3)
-NUMBERS = FORM.numbers
-
-
-def numbered_row(number: float) -> Any:
-    return np.full(NUMBERS, number, np.float32)
-
-
 def test_what_someone_holds_stays_as_it_is() -> None:
     """The dict, one of its arrays, a part of one, or what shares an array's memory."""
-    handed = Handed(FORM)
-    dict_held = handed.of(numbered_row(1))
-    array_held = handed.of(numbered_row(2))["rank"]
-    part_held = handed.of(numbered_row(3))["loss"][1:]
-    shared = memoryview(handed.of(numbered_row(4))["size"])
+    sub_envs = make().sub_envs
+
+    def handed(number: float) -> Any:
+        sub_envs.output.flat[0] = number
+        return sub_envs.observation(0)
+
+    dict_held, array_held, part_held = handed(1), handed(2)["rank"], handed(3)["loss"][1:]
+    shared = memoryview(handed(4)["size"])
     for number in range(5, 12):
-        assert handed.of(numbered_row(number))["busy"][0] == number
+        assert handed(number)["busy"][0] == number
     assert all((array == 1).all() for array in dict_held.values())
-    assert (array_held == 2).all() and (part_held == 3).all() and list(shared) == [4] * 4
+    assert (array_held == 2).all() and (part_held == 3).all() and list(shared) == [4] * len(shared)
 
 
 @pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
-def test_compact_is_the_context_fields_of_all_fields(id: str) -> None:
-    whole, compact = (
-        gym.make_vec(id, 3, capacity=5, actions="slots", **options) for options in ({}, {"fields": "compact"})
-    )
-    (seen, _), (part, _) = whole.reset(seed=1), compact.reset(seed=1)
+def test_the_context_alone_is_that_of_all_fields(id: str) -> None:
+    fields = [field.name for field in CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if "Topics" in id else ())]
+    whole, alone = (gym.make_vec(id, 3, capacity=5, actions="slots", fields=names) for names in (None, fields))
+    (seen, _), (part, _) = whole.reset(seed=1), alone.reset(seed=1)
     for action in range(60):
         context = [name for name, numbers in seen.items() if numbers.shape[1] == 1]
         assert list(part) == context
         assert all((part[name] == seen[name]).all() for name in context)
-        (seen, *_), (part, *_) = whole.step(np.full(3, action % 7)), compact.step(np.full(3, action % 7))
+        (seen, *_), (part, *_) = whole.step(np.full(3, action % 7)), alone.step(np.full(3, action % 7))
 
 
 def test_what_an_owner_does_to_a_batch_s_dicts_changes_no_other() -> None:

@@ -28,7 +28,7 @@ CASES: dict[str, tuple[Scenario, dict[str, Any]]] = {
     "suite": (SuiteScenario("interruption-v1"), {"bound": True}),  # three V side by side
     "topics": (client(duration_s=0.6, scale=2.0), {}),
     "topics in a window": (client(duration_s=0.6, window=3, round_trip_us=30_000), {"reward": "late"}),
-    "pooled": (Uplink(traces=(FADING,), jitter=0.8, duration_s=0.4), {"pool": 4}),  # several episodes of 12 messages
+    "short": (Uplink(traces=(FADING,), jitter=0.8, duration_s=0.4), {}),  # several episodes of 12 messages
     "asks nothing": (Interruption(t_max=3), {"decide_at": "overflow"}),  # each episode ends with its first step
 }
 L, N = 4, 3
@@ -83,11 +83,7 @@ def actions_of(rng: np.random.Generator, envs: SenderVectorEnv) -> np.ndarray[An
 FORMS: list[dict[str, Any]] = [
     {"observation": "flat"},
     {"observation": "flat", "fields": ["loss", "rank", "busy"], "info": "mask"},
-    {"observation": "slots", "info": "none"},
-    {"observation": "slots", "fields": ["busy"]},
-    {"observation": "slots", "mask_in_observation": True},
-    {"observation": "flat", "mask_in_observation": True},
-    {"mask_in_observation": "rllib", "mask_dtype": "bool"},
+    {"fields": ["busy"]},
 ]
 
 
@@ -175,17 +171,14 @@ def test_threads_change_nothing(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["fading", "topics"])
 def test_the_forms_hold_the_same_numbers(case: str) -> None:
-    """flat is what ``FlattenObservation`` makes of the dict; slots are its slot fields side by side."""
-    several = {form: vector(case, observation=form) for form in ("dict", "flat", "slots")}
+    """flat is what ``FlattenObservation`` makes of the dict."""
+    several = {form: vector(case, observation=form) for form in ("dict", "flat")}
     assert several["flat"].single_observation_space == FlattenObservation(several["dict"]).single_observation_space
     seen: dict[str, Any] = {form: envs.reset(seed=4)[0] for form, envs in several.items()}
     rng = np.random.default_rng(0)
     for _ in range(20):
         fields = seen["dict"]
         assert_same(seen["flat"], np.concatenate(list(fields.values()), axis=1))
-        per_slot = [column for column in fields.values() if column.shape[1] == L + 1]
-        assert_same(seen["slots"]["slots"], np.stack(per_slot, axis=-1))
-        assert_same(seen["slots"]["context"], np.concatenate(list(fields.values())[len(per_slot) :], axis=1))
         for form, envs in several.items():
             assert envs.observation_space.contains(seen[form])
         actions = actions_of(rng, several["dict"])
@@ -228,7 +221,7 @@ def test_autoreset_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "form"), [("NextStep", "dict"), ("SameStep", "flat"), ("SameStep", "slots"), ("Disabled", "dict")]
+    ("mode", "form"), [("NextStep", "dict"), ("SameStep", "flat"), ("SameStep", "dict"), ("Disabled", "dict")]
 )
 def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None:
     envs = vector("fading", autoreset_mode=mode, max_episode_steps=9, observation=form)
@@ -296,8 +289,8 @@ test_wrong_use_is_named = refused(
         (lambda n=n: SenderVectorEnv(max_episode_steps=n, actions="slots"), "max_episode_steps = ")
         for n in (0, 1.5, "5")
     ),
-    (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', 'slots'"),
-    (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'summary', 'mask', 'none'"),
+    (lambda: SenderVectorEnv(observation="vector", actions="slots"), "must be one of 'dict', 'flat', None"),
+    (lambda: SenderVectorEnv(info="some", actions="slots"), "must be one of 'full', 'summary', 'mask'"),
     (lambda: SenderVectorEnv(info="summary", actions="slots"), "info = 'summary': is for recorders"),
     (lambda: SenderVectorEnv(num_threads=0, actions="slots"), "num_threads = 0: must be"),
     (lambda: vector("interruption").step(np.zeros(N, np.int64)), "call reset", RESET),

@@ -186,7 +186,6 @@ GENERATE = ["trace", "generate"]
 def test_the_command_writes_traces_and_motion(tmp_path: Path, capsys: Capsys) -> None:
     for arguments in (
         "link --mode train --seed 4 --duration 50 --mean 8e6",
-        "steady --duration 50 --rate 1e6",
         "ramp --duration 50",
         "tunnel --before 15 --after 20",
     ):

@@ -107,7 +107,7 @@ def record(
             numbers[i, T] = 0.0, sub_envs.output.qoi[i], 0.0
             yield Recorded(
                 roles[turns[i]],
-                sub_envs.form.masked(sub_envs.form.of(seen[i, : T + 1].copy()), masks[i, : T + 1].copy()),
+                sub_envs.form.of(seen[i, : T + 1].copy()),
                 taken[i, :T].copy(),
                 numbers[i, :T, 0].copy(),
                 masks[i, : T + 1].copy(),
@@ -157,7 +157,7 @@ def make(
     name = name or f"{env.lower().rsplit('-', 1)[0]}/{kind}-v0"
     root = _folder_for(name, out)
     single = _environment_of(env, options)
-    batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "none"})
+    batch = SenderVectorEnv(min(episodes, ROWS), **{**gym.spec(env).kwargs, **options, "info": "mask"})
     recorded = record(batch, kind, episodes, medium=medium, seed=seed, regret=regret)
     players = {"expert": "clairvoyant", "medium": medium, "random": "random", "mixed": f"clairvoyant, {medium}, random"}
     about = f"bufgym: {players[kind]} in {env}, {options or 'default settings'}, seed {seed}"

@@ -23,7 +23,6 @@ class SuiteScenario:
     data: str | None = None  # folder of recordings, for suites that need one
 
     topics: ClassVar[tuple[Topic, ...]] = ()  # empty: one queue
-    reward_scale: ClassVar[float] = 0.01  # brings a default episode's return between 1 and 10
 
     def __post_init__(self) -> None:
         suite = suites.get(self.suite)

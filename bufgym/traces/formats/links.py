@@ -144,7 +144,7 @@ def detect_format(path: StrPath) -> str:
         raise fault(path, "is empty: must hold a trace")
     names = [name for name, format in FORMATS.items() if format.fits(line.text)]
     if len(names) > 1:
-        rule = f"fits more than one format ({', '.join(names)}): say which with format=... (command line: --format)"
+        rule = f"fits more than one format ({', '.join(names)}): say which with format=... (trace convert --format)"
         raise line.error(line.text, rule)
     for recipe in recipes("links").values():
         if recipe.says and recipe.first.fullmatch(line.text):
