@@ -103,7 +103,7 @@ clean:
 	find bufgym packages agents studies tests -name __pycache__ -prune -exec rm -rf {} +
 
 # Byte code is made when a module is first imported: making it for all takes half the time of an installation.
-$(READY): pyproject.toml packages/live/pyproject.toml packages/papers/pyproject.toml constraints.txt
+$(READY): pyproject.toml $(wildcard packages/*/pyproject.toml) constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "bufgym needs Python 3.11 or newer; '$(PYTHON)' is $$($(PYTHON) --version 2>&1 || true)." >&2; \
 	  echo "Name another one: make PYTHON=python3.11 ..." >&2; exit 1; }
@@ -111,5 +111,6 @@ $(READY): pyproject.toml packages/live/pyproject.toml packages/papers/pyproject.
 	@[ "$$(uname)" != Linux ] || nvidia-smi >/dev/null 2>&1 || \
 	  $(PIP) install --quiet --no-compile --no-deps --retries 0 --timeout 5 -c constraints.txt --index-url $(TORCH_CPU) torch \
 	  >/dev/null 2>&1 || true
-	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]" -e "packages/live[all]" -e "packages/papers[all]"
+	$(PIP) install --quiet --no-compile -c constraints.txt -e ".[dev]" -e "packages/robot[all]" -e "packages/relay[all]" \
+	  -e "packages/papers[all]"
 	@touch $@

@@ -6,7 +6,7 @@ REPO = Path(__file__).resolve().parent.parent
 FOLDERS = (
     "bufgym",
     "tests",
-    *(f"packages/{name}" for name in ("live/bufgym_live", "live/tests", "papers/bufgym_papers", "papers/tests")),
+    *(f"packages/{name}/{part}" for name in ("robot", "relay", "papers") for part in (f"bufgym_{name}", "tests")),
 )
 LONGEST = 350
 """Lines of a file."""

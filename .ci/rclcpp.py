@@ -23,7 +23,7 @@ SOURCES, BUILT, ENVIRONMENT = PLACE / "sources", PLACE / "built", PLACE / "envir
 READY = PLACE / "ready"
 """Holds the fingerprint of this file once all is built."""
 SKIPPED = 77
-TESTS = "packages/live/tests/robot/test_ros2_node.py"
+TESTS = "packages/robot/tests/test_ros2_node.py"
 AMENT = (
     *("core", "export-definitions", "export-dependencies", "export-include-directories", "export-interfaces"),
     *("export-libraries", "export-link-flags", "export-targets", "gen-version-h", "include-directories", "libraries"),

@@ -163,7 +163,7 @@ def nightly(arguments: list[str]) -> list[Stage]:
     many = {"HYPOTHESIS_PROFILE": "nightly"}
     cov = {**many, **measured(folder)}
     add = [*COVERAGE, "--cov-append", *arguments]
-    servers = ["packages/live/tests"]
+    servers = ["packages/robot/tests", "packages/relay/tests"]
     # Named, as pytest ignores no folder that pyproject.toml names.
     others = ["tests", "packages/papers/tests", "agents", "studies", "website", "--ignore=tests/fuzz"]
     # Of the nightly tests, those of kernels alone run uncompiled: clusters, trainings and kills gain nothing.

@@ -27,7 +27,7 @@ class Environment:
     """One environment to train in."""
 
     kind: ClassVar[Kind] = "environment"
-    env: Literal["bufgym/Uplink-v0", "bufgym/Interruption-v0"] = "bufgym/Uplink-v0"
+    env: Literal["bufgym/Uplink-v1", "bufgym/Interruption-v1"] = "bufgym/Uplink-v1"
     """Gymnasium id."""
     capacity: Count = 8
     """L, messages."""

@@ -3,8 +3,8 @@
 import gymnasium as gym
 import bufgym
 
-env = gym.make("bufgym/Uplink-v0", capacity=8)
-envs = gym.make_vec("bufgym/Uplink-v0", num_envs=1024, capacity=8)
+env = gym.make("bufgym/Uplink-v1", capacity=8)
+envs = gym.make_vec("bufgym/Uplink-v1", num_envs=1024, capacity=8)
 print(bufgym.compare(["afr", "drop-oldest"], "lte", capacity=8))
 """
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 __all__ = ["BufgymError", "Comparison", "compare", "curves", "make_policy", "suite"]
 
 ENVIRONMENTS = {
-    "bufgym/Interruption-v0": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),
-    "bufgym/Uplink-v0": ("lte", "a camera stream over bandwidth traces", {}),
-    "bufgym/Suite-v0": ("suite", "the episodes of a benchmark suite, split by split", {}),
+    "bufgym/Interruption-v1": ("interruption", "one interruption of unknown length (AFR paper, Sec. III-B)", {}),
+    "bufgym/Uplink-v1": ("lte", "a camera stream over bandwidth traces", {}),
+    "bufgym/Suite-v1": ("suite", "the episodes of a benchmark suite, split by split", {}),
     "bufgym/Topics-v0": (
         "topics",
         "many topics over one uplink: what to drop, and what to send next (Robofleet)",
@@ -39,8 +39,15 @@ ENVIRONMENTS = {
 """Id -> (name of the scenario, its description, arguments that differ from the usual). Installed packages declare more
 of them, as entry points of the group ``bufgym.environments``."""
 
+_EARLIER: dict[str, tuple[str, str, dict[str, object]]] = {
+    f"{id.removesuffix('-v1')}-v0": (scenario, about, {**options, "reward": "retained"})
+    for id, (scenario, about, options) in ENVIRONMENTS.items()
+    if id.endswith("-v1")
+}
+"""Versions before, which Gymnasium warns of: they differ in the default reward alone."""
+
 _others = {entry.name: entry.load() for entry in _entry_points(group=_GROUP)}
-for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_others}.items():
+for _id, (_scenario, _, _options) in {**ENVIRONMENTS, **_EARLIER, **_others}.items():
     if _id not in _gym.registry:
         _gym.register(
             _id,

@@ -2,7 +2,7 @@
 FROM python:3.12-slim
 WORKDIR /bufgym
 COPY . .
-RUN pip install --no-cache-dir . "./packages/live[relay,mesh]" \
+RUN pip install --no-cache-dir . ./packages/robot "./packages/relay[mesh]" \
  && useradd --system --uid 10001 relay \
  && install -d -o relay /held /cache
 USER relay

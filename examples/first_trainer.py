@@ -23,7 +23,7 @@ def main() -> None:
     options = parser.parse_args()
 
     torch.set_num_threads(1)  # more only wait for one another on a network this small
-    envs = make_vec_env("bufgym/Uplink-v0", reward="regret")
+    envs = make_vec_env("bufgym/Uplink-v1", reward="regret")
     model = PPO("MlpPolicy", envs, seed=options.seed, device="cpu").learn(options.steps)
 
     mine = as_policy(model, "mine")

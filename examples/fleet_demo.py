@@ -22,8 +22,8 @@ from bufgym.model import Link
 from bufgym.policies import Policy, get
 from bufgym.scenario import read_client
 from bufgym.traces import Trace
-from bufgym_live.relay import Config, Foxglove, Robot, Rule, Server, compiled
-from bufgym_live.robot import ShapedLink
+from bufgym_relay import Config, Foxglove, Rule, Server, compiled
+from bufgym_robot import Robot, ShapedLink
 
 CLEAR_BPS: Final = 1_000_000
 FADED_BPS: Final = 100_000

@@ -74,7 +74,7 @@ class Pupil:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.envs: Any = gym.make_vec(
-            "bufgym/Uplink-v0",
+            "bufgym/Uplink-v1",
             settings.episodes,
             capacity=settings.capacity,
             traces=TRAIN,

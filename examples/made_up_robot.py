@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bufgym import BufgymError
 from bufgym.scenario import Stream, read_client
-from bufgym_live.relay import Robot
+from bufgym_robot import Robot
 
 Floats = NDArray[np.float64]
 

@@ -43,7 +43,7 @@ TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 TEST = ["lte-synthetic-6", "lte-synthetic-7"]
 RIVALS = ("min-motion-gap", "afr", "drop-oldest")
 L = 8
-FIELDS = gym.make("bufgym/Uplink-v0", capacity=L, actions="slots", observation="dict").observation_space
+FIELDS = gym.make("bufgym/Uplink-v1", capacity=L, actions="slots", observation="dict").observation_space
 """Fields of an observation. A data set has them flat, one behind the other."""
 
 

@@ -1,6 +1,6 @@
 """A whole step in one file: one sender, one link, AFR, and the environment of one queue with ordered candidates.
 
-This is `bufgym/Uplink-v0` with its default actions and reward, in plain Python. It leaves out byte limits, topics, acks
+This is `bufgym/Uplink-v1` with its default actions and reward, in plain Python. It leaves out byte limits, topics, acks
 and speed. A test plays 200 random episodes here and in bufgym: the drops, H, rewards and observations are the same.
 """
 

@@ -34,7 +34,7 @@ def main() -> None:
     options = parser.parse_args()
 
     fields = ["rank", "loss", "waited_s", "standstill"]
-    envs = gym.make_vec("bufgym/Uplink-v0", num_envs=options.seeds, fields=fields, actions="slots")
+    envs = gym.make_vec("bufgym/Uplink-v1", num_envs=options.seeds, fields=fields, actions="slots")
     observation, _ = envs.reset(seed=0)
     print({name: array.shape for name, array in observation.items()})
     longest = 0.0

@@ -27,7 +27,7 @@ def main() -> None:
     options = parser.parse_args()
 
     # Trains on the links of seeds 0 to 99; the text stands in YAML files and env.spec.to_json() as well.
-    env = gym.make("bufgym/Uplink-v0", traces="own_link:corridor:0-99")
+    env = gym.make("bufgym/Uplink-v1", traces="own_link:corridor:0-99")
     _, info = env.reset(seed=0)
     for _ in range(options.steps):
         _, _, ended, _, info = env.step(env.action_space.sample())

@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="how often to begin anew")
     options = parser.parse_args()
 
-    env = gym.make("bufgym/Uplink-v0", reward=REWARD)
+    env = gym.make("bufgym/Uplink-v1", reward=REWARD)
     for seed in range(options.seeds):
         _, info = env.reset(seed=seed)
         total, terms = 0.0, Counter[str]()

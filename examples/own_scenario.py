@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="episodes of the benchmark")
     options = parser.parse_args()
 
-    env = gym.make("bufgym/Uplink-v0", scenario="halls", slow_bytes_per_s=2e6)
+    env = gym.make("bufgym/Uplink-v1", scenario="halls", slow_bytes_per_s=2e6)
     _, info = env.reset(seed=0)
     for _ in range(options.steps):
         _, _, ended, _, info = env.step(env.action_space.sample())

@@ -27,7 +27,7 @@ def main() -> None:
     print(f"V(0.1) = {v(0.1):.3f}, V(1) = {v(1.0):.3f}")
 
     # As text it stands in YAML files and env.spec.to_json() as well; value=doorways does the same.
-    env = gym.make("bufgym/Uplink-v0", value="own_value:doorways")
+    env = gym.make("bufgym/Uplink-v1", value="own_value:doorways")
     _, info = env.reset(seed=0)
     for _ in range(options.steps):
         _, _, ended, _, info = env.step(env.action_space.sample())

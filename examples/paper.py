@@ -43,7 +43,7 @@ def train(agent, steps, out):
     if (folder / "model.zip").exists():
         return
     world = {"suite": LAB.name, "split": "train", "reward": REWARD}
-    envs = make_vec_env("bufgym/Suite-v0", seed=1000 * seed, monitor_dir=str(folder), **world)
+    envs = make_vec_env("bufgym/Suite-v1", seed=1000 * seed, monitor_dir=str(folder), **world)
     TRAINERS[name]("MlpPolicy", envs, seed=seed, device="cpu").learn(steps).save(folder / "model.zip")
     envs.close()
 

@@ -95,7 +95,7 @@ def make(
 ) -> gym.vector.VectorEnv:
     """The native batch; the agent is asked where the buffer is full."""
     return gym.make_vec(
-        "bufgym/Uplink-v0",
+        "bufgym/Uplink-v1",
         num_envs,
         capacity=settings.capacity,
         traces=traces,

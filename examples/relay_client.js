@@ -1,4 +1,4 @@
-// A relay client in JavaScript, written from packages/live/bufgym_live/relay/PROTOCOL.md alone. Needs Node 22, or a browser.
+// A relay client in JavaScript, written from packages/robot/bufgym_robot/wire/PROTOCOL.md alone. Needs Node 22, or a browser.
 //
 //     node relay_client.js ws://127.0.0.1:7420 NAME [TOPIC JSON]
 // Prints what robots publish, publishes the time as /robots/NAME/clock, and sends one no_drop command, if given.

@@ -24,7 +24,7 @@ from bufgym.sb3 import make_vec_env
 def train(suite: str, capacity: int, steps: int, num_envs: int, path: Path) -> None:
     """PPO with its defaults but for shorter rollouts; the agent serves every L. The model is a zip."""
     envs = make_vec_env(
-        "bufgym/Suite-v0", num_envs, seed=0, suite=suite, split="train", capacity=capacity, reward="regret"
+        "bufgym/Suite-v1", num_envs, seed=0, suite=suite, split="train", capacity=capacity, reward="regret"
     )
     PPO("MlpPolicy", envs, n_steps=256, device="cpu", seed=0).learn(steps).save(path)
 

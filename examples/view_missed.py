@@ -2,7 +2,7 @@
 
     python examples/view_missed.py
 
-Plays policies on the episodes of ``bufgym bench`` (``bufgym/Uplink-v0`` by its defaults) and prints each one's score
+Plays policies on the episodes of ``bufgym bench`` (``bufgym/Uplink-v1`` by its defaults) and prints each one's score
 beside the seconds of view that the server missed. A moment is missed where no image that arrived has ``--overlap`` of
 the camera's image in it: three quarters are what matching two images for a map asks for.
 """

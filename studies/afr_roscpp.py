@@ -3,7 +3,7 @@
 Frames of 230 kB come at 30 Hz for 20 s into a queue of 15, over 24 Mbit/s with 5 s of 2 Mbit/s in the middle, headers
 included, between two network namespaces. Without a round trip the link is the kernel's own (``examples/fade.py``, with
 tc's tbf), as on a robot whose own interface is the bottleneck. The kernel has no delay, so a round trip is
-``bufgym_live.robot.tunnel``'s. "stock" is roscpp as it is. Each run under a policy is played again by the simulator
+``bufgym_robot.tunnel``'s. "stock" is roscpp as it is. Each run under a policy is played again by the simulator
 from its log: ``differ`` counts decisions that are not the same. A decision is timed in the node.
 """
 
@@ -29,13 +29,13 @@ import numpy as np
 
 from bufgym.model import Link
 from bufgym.utils.errors import BufgymError
-from bufgym_live.robot import read_log, replay, tunnel
-from bufgym_live.robot.programs import running
 from bufgym_papers.figures.figure import COLOURS, Figure, at_least_0, finish, legend_below, several
 from bufgym_papers.figures.rows import FigureRows
+from bufgym_robot import read_log, replay, tunnel
+from bufgym_robot.programs import running
 from studies.round_trips import CAPACITY, RATE_HZ, SIZE_BYTES, V, link
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "live" / "tests" / "robot"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "packages" / "robot" / "tests"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 import fade
 import roscpp_cases

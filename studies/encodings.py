@@ -10,7 +10,7 @@
 Robofleet makes its schema from ROS 1 definitions with msg2fbs in github.com/ut-amrl/robofleet. Each message, nested or
 not, is a table with its metadata in slot 0 and then its fields in order. Time is a struct of two uint32, every array a
 vector, and `flatc` writes the larger fields of a table first. We derive the tables from the same definitions, which
-come with `rosbags`, and write them with `flatbuffers`: the extra `robofleet` of `packages/live` installs both.
+come with `rosbags`, and write them with `flatbuffers`: the extra `robofleet` of `packages/robot` installs both.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def _typed(store: Any, type_name: str, value: Content) -> Any:
 
 
 def _flatbuffer(type_name: str, message: Content, topic: str | None) -> bytes:
-    builder = library("flatbuffers", "bufgym-live[robofleet]").Builder(1024)
+    builder = library("flatbuffers", "bufgym-robot[robofleet]").Builder(1024)
     metadata = 0
     if topic is not None:
         texts = [builder.CreateString(text) for text in (type_name.replace("/msg/", "/"), topic)]

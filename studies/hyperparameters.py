@@ -1,6 +1,6 @@
 """What each algorithm of ``train.py`` reaches after some seconds, with its settings.
 
-python -m studies.hyperparameters --env bufgym/Uplink-v0 --seconds 10 60 --algorithms hindsight ppo
+python -m studies.hyperparameters --env bufgym/Uplink-v1 --seconds 10 60 --algorithms hindsight ppo
 
 Each run has as many steps as fit into its seconds, because the learning rate falls over the steps of a run: a pilot
 says how many. The score is that of the kept weights, which are the best on validation, on the held-out episodes.
@@ -17,7 +17,7 @@ from typing import Any
 BESIDE = ("chance", "afr", "always 0", "always 1", "target-gap")
 PILOTS = {"hindsight": 40_000, "ppo": 20_000, "dqn": 20_000}
 """Algorithm, a command of ``train.py`` -> the steps of its pilot."""
-ENVS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+ENVS = ("bufgym/Uplink-v1", "bufgym/Interruption-v1")
 
 
 def trained(env: str, algorithm: str, steps: int, seeds: int) -> tuple[float, dict[str, Any]]:

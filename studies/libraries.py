@@ -1,7 +1,7 @@
 """Each library's trainer by its own settings, on one task: what ``studies.ten_minutes`` runs.
 
 A trainer has the defaults of its library or the numbers of the library's first example: PPO, and from stable-baselines3
-A2C and DQN, too; Tianshou has its DQN. The task is ``Uplink-v0`` with L = 8 and ordered candidates as actions. All of
+A2C and DQN, too; Tianshou has its DQN. The task is ``Uplink-v1`` with L = 8 and ordered candidates as actions. All of
 them are valid, so no library needs a mask.
 """
 
@@ -20,7 +20,7 @@ import torch
 import bufgym  # noqa: F401  (registers the environments)
 from studies.sb3_defaults import Model
 
-ENV, CAPACITY = "bufgym/Uplink-v0", 8
+ENV, CAPACITY = "bufgym/Uplink-v1", 8
 HELD = {"cost": 3, "paired": 3}
 """Decisions that an action holds for in training, by the reward; 1 with others."""
 

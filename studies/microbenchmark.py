@@ -1,4 +1,4 @@
-"""The microbenchmark for speed: the job of one step of ``Uplink-v0``'s batch, without episodes, logs, limits or topics.
+"""The microbenchmark for speed: the job of one step of ``Uplink-v1``'s batch, without episodes, logs, limits or topics.
 
 A step has one decision, an exact link, the next message, and all numbers of the observation and mask.
 """

@@ -103,7 +103,7 @@ def profile(sizes: Sizes) -> str:
     Kernels that write are timed alone, over the batch as it stands after a while. The transition is the remainder.
     """
     batches = [_profile_batch(id, sizes.capacity, sizes) for id in ENVIRONMENTS]
-    tables = [*batches, _profile_batch(TOPICS, sizes.topic_slots, sizes), _profile_single("bufgym/Uplink-v0", sizes)]
+    tables = [*batches, _profile_batch(TOPICS, sizes.topic_slots, sizes), _profile_single("bufgym/Uplink-v1", sizes)]
     return "\n\n".join(tables)
 
 

@@ -43,7 +43,7 @@ from bufgym.utils.tables import Table
 from studies import microbenchmark
 from studies.page import command
 
-ENVIRONMENTS = ("bufgym/Uplink-v0", "bufgym/Interruption-v0")
+ENVIRONMENTS = ("bufgym/Uplink-v1", "bufgym/Interruption-v1")
 TOPICS = "bufgym/Topics-v0"
 SCHEDULER = "gap-priority"
 POLICIES = ("afr", "drop-oldest", "min-gap", "target-gap", "learned")

@@ -27,7 +27,7 @@ import numpy as np
 
 REPO = Path(__file__).resolve().parent.parent
 # It shares robots with the examples, and a relay's settings and clouds with the tests.
-SHARED = ("packages/live/tests", "packages/live/tests/relay", "tests", "examples")
+SHARED = ("packages/robot/tests", "packages/relay/tests", "tests", "examples")
 sys.path[:0] = [str(REPO / name) for name in SHARED]
 
 import page_cases
@@ -35,8 +35,8 @@ from loop_cases import beside as beside
 from made_up_robot import ODOMETRY, SCAN, cast, jpeg, odometry, picture, pose_at, scan
 from relay_cases import client
 
-from bufgym_live.relay import wire
-from bufgym_live.relay.wire import Message
+from bufgym_robot.wire import messages as wire
+from bufgym_robot.wire.messages import Message
 
 SIZE_BYTES, RATE_HZ, MEMORY_S = 50_000, 10, 30.0
 _BINARY, _PING, _PONG, _MASKED = 0x82, 0x89, 0x8A, 0x80

@@ -20,7 +20,7 @@ from studies.relay_load import RATE_HZ, SIZE_BYTES, cpu_s, each, megabytes, rela
 
 from relay_cases import client  # isort: skip  (relay_load has made it known)
 
-from bufgym_live.robot.sockets import free_port
+from bufgym_robot.wire.sockets import free_port
 
 Publish = Callable[[int, bytes], Awaitable[None]]
 Ends = Callable[[int, Callable[[], None]], Any]

@@ -20,9 +20,9 @@ from urllib.parse import SplitResult
 
 import numpy as np
 
-from bufgym_live.relay import address as addresses
-from bufgym_live.relay.session import Session
-from bufgym_live.robot.sockets import free_port
+from bufgym_robot.wire import address as addresses
+from bufgym_robot.wire.session import Session
+from bufgym_robot.wire.sockets import free_port
 from studies.relay_load import CONFIG, beside, served
 
 LOCAL = contextvars.ContextVar("LOCAL", default="127.0.0.1")
@@ -30,7 +30,7 @@ LOCAL = contextvars.ContextVar("LOCAL", default="127.0.0.1")
 
 
 async def reached(address: SplitResult) -> socket.socket:
-    """``bufgym_live.relay.address.reached`` from ``LOCAL``."""
+    """``bufgym_robot.wire.address.reached`` from ``LOCAL``."""
     one = socket.socket()
     try:
         one.setblocking(False)

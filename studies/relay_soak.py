@@ -30,10 +30,10 @@ from nats_cases import nats_server  # isort: skip  (relay_load has made it known
 
 from bufgym.model.topics import Topic
 from bufgym.utils.errors import BufgymError
-from bufgym_live.relay.client import RobotClient
-from bufgym_live.relay.session import Session
-from bufgym_live.relay.stored import UNKNOWN
-from bufgym_live.robot.sockets import free_port
+from bufgym_robot.fleet.client import RobotClient
+from bufgym_robot.wire.messages import UNKNOWN
+from bufgym_robot.wire.session import Session
+from bufgym_robot.wire.sockets import free_port
 
 RELAYS, RATE_HZ, SIZE_BYTES, COMMAND_S, DEADLINE_S = 3, 2.0, 20_000, 0.5, 60
 KILL_S, STALL_EVERY_S, SETTLES_S, SAMPLE_S = 10.0, 60.0, 8.0, 5.0

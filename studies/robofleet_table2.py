@@ -50,7 +50,7 @@ class Reproduction(Figure):
         if not sys.platform.startswith("linux"):
             raise BufgymError("robofleet-table2: virtual memory is read from /proc, which this system does not have")
         for name in ("roslibpy", "rosbags", "flatbuffers", "websockets"):
-            library(name, "bufgym-live[rosbridge]", "robofleet-table2")
+            library(name, "bufgym-robot[rosbridge]", "robofleet-table2")
         return asyncio.run(self._measure())
 
     async def _measure(self) -> FigureRows:
@@ -128,7 +128,7 @@ class Reproduction(Figure):
 @contextlib.asynccontextmanager
 async def _receiver() -> AsyncIterator[tuple[int, list[Any]]]:
     """The other end of our sender; gives its port and the list of received messages."""
-    from bufgym_live.robot.receiver import Receiver
+    from bufgym_robot.receiver import Receiver
 
     came: list[Any] = []
     receiver = Receiver(lambda message: came.append(message.seq))

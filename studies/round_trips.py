@@ -5,7 +5,7 @@
     sudo python -m studies.round_trips --fade --rtt 50 --control bbr reno
 
 Frames of 230 kB come at 30 Hz into a queue of 15; V = 1 - 0.618^d over frames. Each run has two network namespaces of
-its own with tun devices between (``bufgym_live.robot.tunnel``); the bottleneck's buffer holds 200 kB. "system's
+its own with tun devices between (``bufgym_robot.tunnel``); the bottleneck's buffer holds 200 kB. "system's
 buffers" is a sender as stock ROS has it: Drop Oldest, and a socket that takes whatever the system takes. An age is the
 time from the camera to the receiver. ``--control`` is the congestion control of TCP in both namespaces; by default they
 have the machine's. A sender that cannot run here is left out, and the exit code is 1.
@@ -30,8 +30,8 @@ from bufgym.scenario import Episode, messages
 from bufgym.sim import outcome, run
 from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
-from bufgym_live.robot import far, tunnel
-from bufgym_live.robot.receiver import Received
+from bufgym_robot import far, tunnel
+from bufgym_robot.receiver import Received
 from website.markdown import table
 
 RATE_HZ, SIZE_BYTES, CAPACITY = 30, 230_000, 15
@@ -68,7 +68,7 @@ def _mqtt(through: tunnel.Tunnel, episode: Episode, policy: str) -> list[Receive
 
 def _ros(version: str) -> Play:
     def play(through: tunnel.Tunnel, episode: Episode, policy: str) -> list[Received]:
-        player = importlib.import_module(f"bufgym_live.robot.{version}.episode").player(through)
+        player = importlib.import_module(f"bufgym_robot.{version}.episode").player(through)
         came: list[Received] = player(policies.get(policy), episode, CAPACITY, V)
         return came
 

@@ -62,11 +62,11 @@ class Task(NamedTuple):
 
 
 def task_of(name: str, data: str | None) -> Task:
-    """``Uplink-v0``, or a suite by its name: trained on its training links, evaluated on its test links."""
+    """``Uplink-v1``, or a suite by its name: trained on its training links, evaluated on its test links."""
     if name == "lte":
-        return Task("bufgym/Uplink-v0", {}, {})
+        return Task("bufgym/Uplink-v1", {}, {})
     suite = {"suite": name, "data": data}
-    return Task("bufgym/Suite-v0", {**suite, "split": "train"}, {**suite, "split": "test"})
+    return Task("bufgym/Suite-v1", {**suite, "split": "train"}, {**suite, "split": "test"})
 
 
 @dataclass(frozen=True)

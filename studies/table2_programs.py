@@ -71,9 +71,9 @@ def rosbridge(port: int) -> None:
 
 async def robofleet(port: int) -> None:
     """Our sender with Robofleet's rule, n_T = 1 and a flatbuffer for each message, in the place of Robofleet's own."""
-    from bufgym_live.robot.channels import WebSocketChannel
-    from bufgym_live.robot.queue import PolicyQueue
-    from bufgym_live.robot.sender import Sender
+    from bufgym_robot.channels import WebSocketChannel
+    from bufgym_robot.sender import Sender
+    from bufgym_robot.wire.queue import PolicyQueue
     from studies.encodings import encode, stores
 
     store, cost, queue = stores()["ros1"], Cost(), PolicyQueue("robofleet", 32, window=1)

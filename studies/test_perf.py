@@ -51,7 +51,7 @@ def test_a_history_says_what_fell_below_the_median_of_the_last_five(tmp_path: Pa
 
 def test_the_yardstick_writes_the_numbers_of_the_environment() -> None:
     """It is set to the state of an environment; those that need its link and past stay out."""
-    env: Any = gym.make("bufgym/Uplink-v0", capacity=4, observation="flat", actions="slots").unwrapped
+    env: Any = gym.make("bufgym/Uplink-v1", capacity=4, observation="flat", actions="slots").unwrapped
     flat, info = env.reset(seed=3)
     for k in range(40):
         flat, _, ended, _, info = env.step(5 if info["action_mask"][5] else k % 4)

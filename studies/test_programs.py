@@ -18,7 +18,7 @@ SHORT = {
     "studies.relay_others": "--robots 2 --viewers 1 --seconds 1",
     "studies.relay_return": "--clients 2 --kills 1 --away 1",
     "studies.relay_soak": "--robots 3 --viewers 3 --minutes 0.05",
-    "studies.hyperparameters": "--env bufgym/Uplink-v0 --seconds 1 --algorithms hindsight",
+    "studies.hyperparameters": "--env bufgym/Uplink-v1 --seconds 1 --algorithms hindsight",
 }
 """Program and verb -> the options that make it short."""
 NEEDED = {
@@ -36,7 +36,7 @@ ELSEWHERE = {
     "studies.peers": "needs the other packages",
     "studies.plausible": "tests/traces/test_plausible.py",
     "studies.perf": "studies/test_perf.py",
-    "studies.round_trips": "packages/live/tests/robot/test_round_trip.py",
+    "studies.round_trips": "packages/robot/tests/test_round_trip.py",
     "studies.sb3_defaults": "studies/test_sb3_defaults.py",
     "studies.shipped": "studies/test_shipped.py",
     "studies.yardstick": "studies/test_yardstick.py",
@@ -46,7 +46,7 @@ ELSEWHERE = {
     "website.interfaces": "website/test_interfaces.py",
     "website.played": "website/test_played.py",
     "website.previews": "website/test_previews.py",
-    "website.relay_options": "packages/live/tests/relay/test_options_page.py",
+    "website.relay_options": "packages/relay/tests/test_options_page.py",
     "website.returns": "it plays 100 episodes in each environment, and takes minutes",
     "website.row": "needs the folder of a suite's run",
     "website.shares": "needs the folder of a suite's run",

@@ -126,7 +126,7 @@ def test_what_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     stores.cache_clear()
     for library, encoding, extra in (
         ("rosbags.typesys", "cdr", "ros"),
-        ("flatbuffers", "robofleet", "bufgym-live[robofleet]"),
+        ("flatbuffers", "robofleet", "bufgym-robot[robofleet]"),
     ):
         monkeypatch.setitem(sys.modules, library, None)  # None there makes the import fail
         refuse(re.escape(f"needs {library}: {install(extra)}"), encode, "PoseStamped", content("PoseStamped"), encoding)

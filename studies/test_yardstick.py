@@ -40,4 +40,4 @@ def test_a_rule_that_is_level_does_not() -> None:
 def test_it_prints_a_line_for_each(capsys: pytest.CaptureFixture[str]) -> None:
     yardstick.page(capacities=(5,), episodes=3)
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3 and lines[2].startswith("| Uplink-v0, L = 5 | 0.")
+    assert len(lines) == 3 and lines[2].startswith("| Uplink-v1, L = 5 | 0.")

@@ -62,7 +62,7 @@ def page(
     suites: Sequence[str] = (), capacities: Sequence[int] = (5, 8, 16), seeds: int | None = None, episodes: int = 200
 ) -> None:
     """Play them all, and print the table."""
-    lines = [line(f"Uplink-v0, L = {capacity}", of_environment(capacity, episodes)) for capacity in capacities]
+    lines = [line(f"Uplink-v1, L = {capacity}", of_environment(capacity, episodes)) for capacity in capacities]
     lines += [line(name, of_suite(name, seeds)) for name in suites]
     head = ["episodes", *(policy.name for policy in UNTAUGHT), "AFR", "best rule", "which"]
     print(*table([*head, "share, less the better constant's [95 %]", "separates"], lines), sep="\n")

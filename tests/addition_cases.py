@@ -127,7 +127,7 @@ class MemoryBus:
 
 
 BUSES: Final[dict[str, Open]] = {"memory": MemoryBus, '''
-LIVE, PAPERS = "packages/live/bufgym_live", "packages/papers/bufgym_papers"
+ROBOT, PAPERS = "packages/robot/bufgym_robot", "packages/papers/bufgym_papers"
 ROWS = {
     "a policy": Addition(
         {},
@@ -148,7 +148,7 @@ ROWS = {
             "bufgym/model/observe/on_board.py": ("ON_BOARD_FIELDS = (\n", f"ON_BOARD_FIELDS = ({FIELD}"),
             "docs/guide/yours-to-change.md": ("- `rate_trend`\n", "- `rate_trend`\n- `half_full`\n"),
         },
-        "env = gym.make('bufgym/Uplink-v0', actions='slots', fields=['half_full', 'occupancy'], capacity=3)\n"
+        "env = gym.make('bufgym/Uplink-v1', actions='slots', fields=['half_full', 'occupancy'], capacity=3)\n"
         "env.reset(seed=0)\n"
         "for _ in range(40):\n"
         "    seen = env.step(3)[0]\n"
@@ -159,7 +159,7 @@ ROWS = {
     "a reward term": Addition(
         {},
         {"bufgym/model/observe/terms.py": ('\n\n@built_in("energy"', f'\n{TERM}\n\n@built_in("energy"')},
-        "env = gym.make('bufgym/Uplink-v0', reward={'starved': 1.0}); env.reset(seed=0)\n"
+        "env = gym.make('bufgym/Uplink-v1', reward={'starved': 1.0}); env.reset(seed=0)\n"
         "assert env.step(0)[1] in (-1.0, 0.0)",
     ),
     "a scenario": Addition(
@@ -198,7 +198,7 @@ ROWS = {
                 "        self.sloth = options.sloth\n        self._beside =",
             ),
         },
-        "assert gym.make('bufgym/Uplink-v0', sloth=3).unwrapped.sub_envs.sloth == 3",
+        "assert gym.make('bufgym/Uplink-v1', sloth=3).unwrapped.sub_envs.sloth == 3",
     ),
     "a trace format": Addition(
         {},
@@ -223,10 +223,10 @@ ROWS = {
     "a transport": Addition(
         {},
         {
-            f"{LIVE}/robot/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
-            f"{LIVE}/robot/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
+            f"{ROBOT}/buses.py": ("BUSES: Final[dict[str, Open]] = {", BUS.lstrip("\n")),
+            f"{ROBOT}/commands.py": ('Literal["tcp", ', 'Literal["memory", "tcp", '),
         },
-        "from bufgym_live.robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
+        "from bufgym_robot import TRANSPORTS, PolicyQueue, Receiver, Sender\n"
         "async def all_come():\n"
         "    came = []\n"
         "    receiver = Receiver(came.append)\n"
@@ -263,5 +263,5 @@ def copied(folder: Path, rows: Iterable[str], forgotten: Collection[str] = ()) -
 
 def surroundings(folder: Path) -> dict[str, str]:
     """The environment of a process that imports the copy in a folder, as plain Python."""
-    places = os.pathsep.join(str(folder / name) for name in (".", "packages/live", "packages/papers"))
+    places = os.pathsep.join(str(folder / name) for name in (".", "packages/robot", "packages/papers"))
     return {**os.environ, "PYTHONPATH": places, "BUFGYM_KERNELS": "python", "MPLBACKEND": "agg"}

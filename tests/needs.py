@@ -56,7 +56,7 @@ NEEDS = {
         "ROS 1 in C++",
         apt=("g++", "cmake", "pkg-config", *_ROS1, "libroscpp-dev", "libnav-msgs-dev", "libsensor-msgs-dev"),
     ),
-    "ros2": Need("ROS 2", pip=("-e", "packages/live[ros2]")),
+    "ros2": Need("ROS 2", pip=("-e", "packages/robot[ros2]")),
     "rclcpp": Need("ROS 2 in C++", by_hand="run .venv/bin/python .ci/rclcpp.py, which builds it (minutes, once)"),
     "rclcpp_build": Need("rclcpp's build", apt=("git", "g++", "cmake", "libtinyxml2-dev", "libconsole-bridge-dev")),
     "compiler": Need("C and C++ compilers", apt=("gcc", "g++", "clang", "cmake"), programs=_BUILD),

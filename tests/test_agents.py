@@ -37,7 +37,7 @@ def test_a_row_of_a_mix_is_the_environment_of_its_cell() -> None:
     """Rows 0 to 2 are of the first cell, 3 to 6 of the second: the same seeds alone give the same numbers."""
     env, rng = mixed_rows(), np.random.default_rng(0)
     alone = [
-        SenderVectorEnv(n, c.scenario, c.capacity, autoreset_mode="SameStep", info="mask")
+        SenderVectorEnv(n, c.scenario, c.capacity, autoreset_mode="SameStep", reward="retained", info="mask")
         for c, n in zip(MIXED, (3, 4), strict=True)
     ]
     env.reset(seed=5)

@@ -16,9 +16,9 @@ import bufgym.envs
 from bufgym.cli.listing import environments
 
 SMALL: dict[str, dict[str, Any]] = {
-    "bufgym/Interruption-v0": {"t_max": 20},
-    "bufgym/Uplink-v0": {"duration_s": 1.0, "size_bytes": 1_000_000},
-    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+    "bufgym/Interruption-v1": {"t_max": 20},
+    "bufgym/Uplink-v1": {"duration_s": 1.0, "size_bytes": 1_000_000},
+    "bufgym/Suite-v1": {"suite": "interruption-v1"},
     "bufgym/Topics-v0": {"duration_s": 0.1},
     "bufgym/Mapping-v0": {},
 }

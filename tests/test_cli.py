@@ -36,7 +36,7 @@ def trace(tmp_path: Path) -> str:
 def test_list_names_everything_there_is(capsys: Capsys) -> None:
     text = shown(["list"], capsys)
     names = [*policies.names(), *traces.shipped(), *LISTS, *shipped_calls().values()]
-    names += ["bufgym/Uplink-v0", "lte", "retained", "service_ratio", "every=3"]
+    names += ["bufgym/Uplink-v1", "lte", "retained", "service_ratio", "every=3"]
     tables = (observe.CANDIDATE_FIELDS, observe.QUEUE_FIELDS, observe.FIELDS, observe.TOPIC_FIELDS)
     names += [field.name for fields in (*tables, observe.ON_BOARD_FIELDS) for field in fields]
     assert not [name for name in names if name not in text]
@@ -76,13 +76,13 @@ def test_ctrl_c_and_a_reader_that_left(monkeypatch: Patch, capsys: Capsys, tmp_p
 def test_play_writes_a_film(tmp_path: Path) -> None:
     """A picture for each decision, and one of the end; 5 a second."""
     film = tmp_path / "film.gif"
-    assert main(["play", "--env", "Interruption-v0", "--steps", "3", "--out", str(film)]) == 0
+    assert main(["play", "--env", "Interruption-v1", "--steps", "3", "--out", str(film)]) == 0
     with Image.open(film) as picture:
         assert (picture.n_frames, picture.size, picture.info["duration"]) == (3, (800, 400), 200)
 
 
 def test_play_ends_where_bench_does(capsys: Capsys) -> None:
-    words = "play --env Interruption-v0 --policies afr --speed 1000 --seed 3 --capacity 4 --steps 400"
+    words = "play --env Interruption-v1 --policies afr --speed 1000 --seed 3 --capacity 4 --steps 400"
     over = shown(words.split(), capsys).splitlines()[-1]
     (row,) = run([policies.get("afr")], scenario.get("interruption"), [4], [3])
     assert over == (
@@ -145,10 +145,10 @@ def test_bench_takes_shipped_traces_and_all_policies_by_default(capsys: Capsys) 
 
 @pytest.mark.skipif(not JIT, reason=needs("compiled", "it plays whole benchmarks, which takes compiled code"))
 def test_bench_meets_the_episodes_of_the_environment_by_default(tmp_path: Path) -> None:
-    """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v0 plays by these numbers; neither side has an argument."""
+    """Row (trace, seed) is what ``reset`` of bufgym/Uplink-v1 plays by these numbers; neither side has an argument."""
     assert main(["bench", "--seeds", "1", "--policies", "drop-oldest", "--format", "csv", "--out", str(tmp_path)]) == 0
     (row,) = (row for row in read_rows(tmp_path / "rows.csv") if row["trace"] == "lte-synthetic-3")
-    env = gym.make("bufgym/Uplink-v0", bound=True, actions="slots").unwrapped
+    env = gym.make("bufgym/Uplink-v1", bound=True, actions="slots").unwrapped
     _, info = env.reset(options={"trace": "lte-synthetic-3", "seed": 0})
     ended = False
     while not ended:

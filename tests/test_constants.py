@@ -29,7 +29,7 @@ def qoi(policy: policies.Policy, episodes: Sequence[Episode] = EPISODES) -> list
 @pytest.mark.parametrize("action", range(len(CONSTANT)))
 def test_a_constant_action_does_what_it_does_in_the_environment(action: int) -> None:
     n = len(EPISODES)
-    envs = gym.make_vec("bufgym/Uplink-v0", n, capacity=L, scenario=LTE)
+    envs = gym.make_vec("bufgym/Uplink-v1", n, capacity=L, scenario=LTE)
     envs.reset(seed=0, options={"episodes": EPISODES})
     found, over = np.zeros(n), np.zeros(n, np.bool_)
     while not over.all():

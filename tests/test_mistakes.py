@@ -227,17 +227,17 @@ def mistakes() -> Iterator[tuple[str, Callable[[str], Any]]]:
     for name in ("capacity", "progress", "against", "max_bytes", "decide_at"):
         yield name, lambda wrong: bufgym.compare("afr", "lte", **{wrong: 1})
     for name in ("reward", "decide_at", "observation", "fields", "capacity", "max_bytes", "duration_s", "rate_hz"):
-        yield name, lambda wrong: gym.make("bufgym/Uplink-v0", **{wrong: 1}, actions="slots")
+        yield name, lambda wrong: gym.make("bufgym/Uplink-v1", **{wrong: 1}, actions="slots")
         yield (
             name,
-            lambda wrong: gym.make_vec("bufgym/Uplink-v0", 2, "vector_entry_point", **{wrong: 1}, actions="slots"),
+            lambda wrong: gym.make_vec("bufgym/Uplink-v1", 2, "vector_entry_point", **{wrong: 1}, actions="slots"),
         )
     for name in ("retained", "delivered", "delay"):
-        yield name, lambda wrong: gym.make("bufgym/Uplink-v0", reward={wrong: 1}, actions="slots")
+        yield name, lambda wrong: gym.make("bufgym/Uplink-v1", reward={wrong: 1}, actions="slots")
     for name in ("time_before", "relative_loss", "backlog", "service_ratio"):
-        yield name, lambda wrong: gym.make("bufgym/Uplink-v0", fields=["rank", wrong], actions="slots")
+        yield name, lambda wrong: gym.make("bufgym/Uplink-v1", fields=["rank", wrong], actions="slots")
     for name in ("episode", "trace", "scenario"):
-        yield name, lambda wrong: gym.make("bufgym/Uplink-v0", actions="slots").reset(options={wrong: 1})
+        yield name, lambda wrong: gym.make("bufgym/Uplink-v1", actions="slots").reset(options={wrong: 1})
 
 
 CASES = list(mistakes())

@@ -23,7 +23,8 @@ def unnamed(file: Path) -> list[str]:
 
 
 def test_every_skip_names_its_group() -> None:
-    folders = "tests", "packages/live/tests", "packages/papers/tests", "agents", "studies", "website"
+    packages = (f"packages/{name}/tests" for name in ("robot", "relay", "papers"))
+    folders = "tests", *packages, "agents", "studies", "website"
     files = [REPO / "conftest.py", *(file for folder in folders for file in (REPO / folder).rglob("*.py"))]
     lines = [line for file in files for line in unnamed(file)]
     assert lines == [], "each needs reason=needs(group, why), with a group of tests/needs.py"

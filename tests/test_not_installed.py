@@ -16,8 +16,14 @@ from bufgym.utils import packages
 from bufgym.utils.errors import BufgymError
 
 REPO = Path(__file__).resolve().parent.parent
-COMMANDS = {"live": "live", "ros2": "live", "relay": "live", "reproduce": "papers"}
-"""Command -> the folder of the package that has it."""
+COMMANDS = {
+    "live": ["robot"],
+    "ros2": ["robot"],
+    "robot": ["robot"],
+    "relay": ["robot", "relay"],
+    "reproduce": ["papers"],
+}
+"""Command -> the folder of the package that has it, last, behind those of the packages that it needs."""
 
 
 @pytest.fixture
@@ -39,21 +45,22 @@ def wheel(monkeypatch: Patch, tmp_path: Path) -> None:
 
 def test_a_command_of_a_package_is_told_in_a_checkout(bare: None, capsys: Capsys) -> None:
     assert "live" not in shown(["--help"], capsys)
-    for command, name in COMMANDS.items():
-        fault = f"{command} comes with the package bufgym-{name}: pip install -e {REPO / 'packages' / name}"
-        fails([command, "send"], fault, capsys)
+    for command, names in COMMANDS.items():
+        folders = " ".join(f"-e {REPO / 'packages' / name}" for name in names)
+        fails([command, "send"], f"{command} comes with the package bufgym-{names[-1]}: pip install {folders}", capsys)
     fails(
         ["export", "afr", "x.h", "--to", "c"],
-        "With more options export comes with the package bufgym-live: pip install",
+        "With more options export comes with the package bufgym-robot: pip install",
         capsys,
     )
     fails(["nonsense"], 'Unknown command "nonsense"', capsys)
 
 
 def test_so_it_is_by_a_wheel(bare: None, wheel: None, capsys: Capsys) -> None:
-    for command, name in COMMANDS.items():
-        fault = f"{command} comes with the package bufgym-{name}: pip install packages/{name}, in bufgym's source tree"
-        fails([command], fault, capsys)
+    for command, names in COMMANDS.items():
+        folders = " ".join(f"packages/{name}" for name in names)
+        where = f"bufgym-{names[-1]}: pip install {folders}, in bufgym's source tree"
+        fails([command], f"{command} comes with the package {where}", capsys)
 
 
 def test_a_wheel_carries_what_every_package_declares(wheel: None) -> None:
@@ -81,7 +88,7 @@ for make in (gym.make, gym.make_vec):
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=True)
     listed, *fault = done.stdout.splitlines()
-    assert "bufgym/Uplink-v0" in listed and "bufgym/Mapping-v0" not in listed
+    assert "bufgym/Uplink-v1" in listed and "bufgym/Mapping-v0" not in listed
     command = f"pip install -e {REPO / 'packages' / 'papers'}"
     assert fault == [f"bufgym/Mapping-v0 comes with the package bufgym-papers: {command}"] * 2
 
@@ -89,7 +96,7 @@ for make in (gym.make, gym.make_vec):
 def test_a_stand_in_takes_any_argument() -> None:
     with pytest.raises(BufgymError, match="there"):
         packages.raise_absent("there", num_envs=3, render_mode="human")
-    assert "fault" not in gym.spec("bufgym/Uplink-v0").kwargs
+    assert "fault" not in gym.spec("bufgym/Uplink-v1").kwargs
 
 
 WITHOUT_EXTRAS = """
@@ -97,7 +104,7 @@ import importlib.abc, io, re, sys
 from contextlib import redirect_stdout
 from importlib import metadata
 
-needed, waiting = set(), ["bufgym", "bufgym-live", "bufgym-papers"]
+needed, waiting = set(), ["bufgym", "bufgym-robot", "bufgym-papers"]
 while waiting:
     name = re.sub(r"[-_.]+", "-", waiting.pop()).lower()
     if name not in needed:
@@ -111,7 +118,8 @@ while waiting:
 def is_needed(distributions):
     return any(re.sub(r"[-_.]+", "-", name).lower() in needed for name in distributions)
 
-optional = {top for top, of in metadata.packages_distributions().items() if not is_needed(of)}
+tops = metadata.packages_distributions().items()
+optional = {top for top, of in tops if not is_needed(of) and not top.startswith("bufgym")}
 assert {"msgspec", "torch", "jinja2"} & optional, sorted(needed)
 
 class Hidden(importlib.abc.MetaPathFinder):
@@ -144,13 +152,15 @@ for words in below(every):
         code = cli.main([*words, "--help"])
     assert code == 0 and fault.getvalue().startswith("Usage: bufgym"), words
     print(*words)
-for words in (["export", "own.py", "own.safetensors", "--name", "own"], ["relay", "serve", "--config", "x.toml"]):
+for words in (["export", "own.py", "own.safetensors", "--name", "own"], ["robot", "--bag", "x.mcap"]):
     assert cli.main(words) == 2
 """
     )
     done = subprocess.run([sys.executable, "-c", program], cwd=REPO, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {"bench", "trace from-bag", "relay serve", "live send", "reproduce"} <= set(done.stdout.splitlines())
-    export, relay = done.stderr.splitlines()
+    assert {"bench", "trace from-bag", "relay serve", "robot", "live send", "reproduce"} <= set(
+        done.stdout.splitlines()
+    )
+    export, robot = done.stderr.splitlines()
     assert "bufgym.sb3 needs torch: pip install" in export and "[train]" in export
-    assert "bufgym relay needs msgspec: pip install" in relay and "[relay]" in relay
+    assert "bufgym robot needs msgspec: pip install" in robot and "[relay]" in robot

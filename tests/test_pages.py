@@ -220,7 +220,7 @@ def test_the_command_runs(line: str, tmp_path: Path, monkeypatch: Patch, capsys:
 BEFORE = {
     "docs/guide/experts.md": """
         import gymnasium as gym
-        env = gym.make("bufgym:bufgym/Interruption-v0", capacity=2, t_max=6)
+        env = gym.make("bufgym:bufgym/Interruption-v1", capacity=2, t_max=6)
         env.reset(seed=0)""",
     "docs/guide/real-sockets.md": """
         import types
@@ -239,8 +239,8 @@ AFTER = {"docs/guide/truth.md": "assert round(best.value, 5) == 0.98311", "docs/
 """What a page says of its program."""
 
 ELSEWHERE = {
-    "docs/guide/ros1.md": "packages/live/tests/robot/test_ros1.py",
-    "docs/guide/ros2.md": "packages/live/tests/robot/test_ros2.py",
+    "docs/guide/ros1.md": "packages/robot/tests/test_ros1.py",
+    "docs/guide/ros2.md": "packages/robot/tests/test_ros2.py",
     "docs/guide/own-policy.md": "above, by a command",
     "docs/guide/yours-to-change.md": "below",
 }

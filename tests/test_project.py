@@ -66,7 +66,7 @@ NEEDED_LATER = (
     "sqlite3", "ssl", "tqdm",
 )  # fmt: skip
 """What a first step does without, of Python and of libraries."""
-MADE = "'bufgym/Uplink-v0', capacity=8"
+MADE = "'bufgym/Uplink-v1', capacity=8"
 FIRST = {
     "import": "",
     "step": f"e = gymnasium.make({MADE}); e.reset(seed=0); e.step(0)",
@@ -100,11 +100,11 @@ def test_a_hint_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     """pip finds it in the bufgym that is installed; a source tree is installed with it."""
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.2.0")
     assert errors.install("plot") == 'pip install "bufgym[plot]"'
-    assert errors.install("bufgym-live[relay]") == 'pip install "bufgym-live[relay]"'
+    assert errors.install("bufgym-robot[relay]") == 'pip install "bufgym-robot[relay]"'
     monkeypatch.setattr(importlib.metadata, "version", importlib.metadata.distribution)
     monkeypatch.setattr(importlib.metadata.Distribution, "discover", lambda **_: iter(()))
     assert errors.install("plot") == 'pip install -e ".[plot]"'
-    assert errors.install("bufgym-live[relay]") == 'pip install -e "packages/live[relay]"'
+    assert errors.install("bufgym-robot[relay]") == 'pip install -e "packages/robot[relay]"'
 
 
 def test_every_hint_names_an_extra_that_there_is() -> None:
@@ -120,7 +120,7 @@ def test_every_hint_names_an_extra_that_there_is() -> None:
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in places:
                 words = call.args[places[call.func.id] :][:1]
                 named |= {word.value for word in words if isinstance(word, ast.Constant)}
-    assert {"plot", "train", "fleet", "ros", "bufgym-live[relay]"} <= named <= extras
+    assert {"plot", "train", "fleet", "ros", "bufgym-robot[relay]"} <= named <= extras
 
 
 PACKAGES = {file.parent.name: file for file in sorted((REPO / "packages").glob("*/pyproject.toml"))}

@@ -35,10 +35,10 @@ from bufgym.sim.metrics import outcome
 from bufgym.utils.errors import BufgymError
 
 SMALL: dict[str, dict[str, Any]] = {
-    "bufgym/Interruption-v0": {"capacity": 3, "t_max": 20},
-    "bufgym/Uplink-v0": {"capacity": 3, "duration_s": 1.0, "size_bytes": 1_000_000},
+    "bufgym/Interruption-v1": {"capacity": 3, "t_max": 20},
+    "bufgym/Uplink-v1": {"capacity": 3, "duration_s": 1.0, "size_bytes": 1_000_000},
     "bufgym/Topics-v0": {"capacity": 3, "duration_s": 0.1},
-    "bufgym/Suite-v0": {"capacity": 3, "suite": "interruption-v1"},
+    "bufgym/Suite-v1": {"capacity": 3, "suite": "interruption-v1"},
 }
 L = 3
 
@@ -84,7 +84,7 @@ def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> 
 
 def test_a_time_limit_truncates() -> None:
     envs = make_vec_env(
-        "bufgym/Uplink-v0", 2, seed=0, max_episode_steps=5, **SMALL["bufgym/Uplink-v0"], actions="slots"
+        "bufgym/Uplink-v1", 2, seed=0, max_episode_steps=5, **SMALL["bufgym/Uplink-v1"], actions="slots"
     )
     envs.reset()
     for step in range(1, 11):
@@ -96,7 +96,7 @@ def test_a_time_limit_truncates() -> None:
 
 
 def test_masks_and_attributes() -> None:
-    envs = make_vec_env("bufgym/Interruption-v0", 5, **SMALL["bufgym/Interruption-v0"], actions="slots")
+    envs = make_vec_env("bufgym/Interruption-v1", 5, **SMALL["bufgym/Interruption-v1"], actions="slots")
     envs.reset()
     masks = get_action_masks(envs)
     assert is_masking_supported(envs) and masks.dtype == np.bool_
@@ -114,7 +114,7 @@ def test_masks_and_attributes() -> None:
 
 
 def test_seeds_and_options_hold_for_one_reset() -> None:
-    envs = make_vec_env("bufgym/Interruption-v0", 2, **SMALL["bufgym/Interruption-v0"], actions="slots")
+    envs = make_vec_env("bufgym/Interruption-v1", 2, **SMALL["bufgym/Interruption-v1"], actions="slots")
     assert envs.seed(3) == [3, 4]
 
     def lengths() -> list[int]:
@@ -138,7 +138,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
 def test_a_monitor_file(tmp_path: Path) -> None:
     """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
     given: dict[str, Any] = {"t_max": 20, "law": "fixed", "capacity": L, "seed": 5}
-    envs = make_vec_env("bufgym/Interruption-v0", 3, monitor_dir=str(tmp_path), **given, actions="slots")
+    envs = make_vec_env("bufgym/Interruption-v1", 3, monitor_dir=str(tmp_path), **given, actions="slots")
     assert envs.num_envs == 3
     envs.reset()
     for _ in range(40):
@@ -149,26 +149,26 @@ def test_a_monitor_file(tmp_path: Path) -> None:
     (file,) = get_monitor_files(str(tmp_path))  # which ``load_results`` reads with pandas
     assert Path(file).name == "0.monitor.csv" and len([*tmp_path.iterdir()]) == 1
     header, *lines = Path(file).read_text().splitlines()
-    assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v0"
+    assert json.loads(header[1:])["env_id"] == "bufgym/Interruption-v1"
     results = list(csv.DictReader(lines))
     assert [row["l"] for row in results] == ["20"] * 6
     assert [float(row["r"]) for row in results] == pytest.approx([infos[0]["episode"]["r"]] * 6, abs=1e-6)
 
 
 test_what_a_native_batch_cannot_do_is_an_error = refused(
-    (lambda: make_vec_env("bufgym/Interruption-v0", num_envs=2, actions="slots"), "stable-baselines3 calls it n_envs"),
+    (lambda: make_vec_env("bufgym/Interruption-v1", num_envs=2, actions="slots"), "stable-baselines3 calls it n_envs"),
     (
-        lambda: make_vec_env("bufgym/Uplink-v0", env_kwargs={"capacity": 8}, actions="slots"),
+        lambda: make_vec_env("bufgym/Uplink-v1", env_kwargs={"capacity": 8}, actions="slots"),
         "'env_kwargs': settings go by",
         TypeError,
     ),
     (
-        lambda: make_vec_env("bufgym/Uplink-v0", vec_env_cls=GymVecEnv, actions="slots"),
+        lambda: make_vec_env("bufgym/Uplink-v1", vec_env_cls=GymVecEnv, actions="slots"),
         "'vec_env_cls': stable_baselines3.*make_",
         TypeError,
     ),
     *((lambda id=id: make_vec_env(id), "has no native batch") for id in ("CartPole-v1", Monitor)),
-    (lambda: GymVecEnv(gym.make_vec("bufgym/Uplink-v0", 2, actions="slots")), "SAME_STEP"),
+    (lambda: GymVecEnv(gym.make_vec("bufgym/Uplink-v1", 2, actions="slots")), "SAME_STEP"),
 )
 
 
@@ -180,7 +180,7 @@ def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **opt
     """A model with large random weights: its decisions vary."""
     if algorithm is not DQN:
         options = {"n_steps": 8, **({} if algorithm is A2C else {"batch_size": 16}), **options}
-    env = env or make_vec_env("bufgym/Uplink-v0", 2, seed=0, decide_at="arrival", **WORLD, actions="slots")
+    env = env or make_vec_env("bufgym/Uplink-v1", 2, seed=0, decide_at="arrival", **WORLD, actions="slots")
     model = algorithm(policy, env, seed=1, device="cpu", **options)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -191,7 +191,7 @@ def untrained(algorithm: Any, policy: Any, env: Any = None, seed: int = 4, **opt
 
 def flat_env() -> Any:
     return env_util.make_vec_env(
-        lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v0", **WORLD, actions="slots")), 2
+        lambda: gym.wrappers.FlattenObservation(gym.make("bufgym/Uplink-v1", **WORLD, actions="slots")), 2
     )
 
 
@@ -233,7 +233,7 @@ def test_any_model_decides_as_in_the_environment(algorithm: Any, saved: bool, ne
 
 
 def test_a_slot_network_serves_every_L_and_a_few_fields_are_enough(tmp_path: Path) -> None:
-    env = make_vec_env("bufgym/Uplink-v0", 2, seed=0, fields=FIELDS, **WORLD, actions="slots")
+    env = make_vec_env("bufgym/Uplink-v1", 2, seed=0, fields=FIELDS, **WORLD, actions="slots")
     model = untrained(MaskablePPO, SlotPolicy, env, 6, policy_kwargs={"width": 8})
     model.save(tmp_path / "slots.zip")
     for policy in (as_policy(model, "slots"), as_policy(tmp_path / "slots.zip")):
@@ -295,11 +295,11 @@ def test_an_agent_for_topics_is_a_scheduler(form: str, network: str) -> None:
 
 
 def test_models_that_cannot_be_policies_are_refused(tmp_path: Path) -> None:
-    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v0", 2, **WORLD, actions="slots")
+    scenario, uplink = Interruption(t_max=20), make_vec_env("bufgym:bufgym/Uplink-v1", 2, **WORLD, actions="slots")
     with pytest.raises(BufgymError, match="policy ppo: trained for L = 3, not for L = 5; only a network that scores"):
         run(as_policy(untrained(PPO, "MultiInputPolicy")), [scenario.episode(20)], 5, scenario.value)
     pole = untrained(PPO, "MlpPolicy", env_util.make_vec_env("CartPole-v1", 2)).policy
-    few = make_vec_env("bufgym/Uplink-v0", 2, fields=["rank"], observation="flat", **WORLD, actions="slots")
+    few = make_vec_env("bufgym/Uplink-v1", 2, fields=["rank"], observation="flat", **WORLD, actions="slots")
     del few.observation_space.fields  # as of a wrapper that makes a space of its own
     for model, says in (
         (pole, r"action space Discrete\(2\): must be Discrete\(L \+ 2\)"),

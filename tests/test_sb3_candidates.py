@@ -40,7 +40,7 @@ def model_of(algorithm: Any, policy: str = "MlpPolicy", seed: int = 4, env: Any 
     """
     if algorithm not in (DQN, QRDQN):
         options = {"n_steps": 8, **({} if algorithm is A2C else {"batch_size": 16}), **options}
-    envs = make_vec_env("bufgym/Uplink-v0", 2, seed=0, **{**WORLD, **(env or {})})
+    envs = make_vec_env("bufgym/Uplink-v1", 2, seed=0, **{**WORLD, **(env or {})})
     model = algorithm(policy, envs, seed=1, device="cpu", **options)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -120,7 +120,7 @@ def test_an_exported_model_is_one_policy_like_any_other(tmp_path: Path) -> None:
 @pytest.mark.nightly
 def test_a_model_that_has_learned_decides_so_too(tmp_path: Path) -> None:
     """2,000 steps by stable-baselines3's defaults, but for rollouts of 64 steps."""
-    model: Any = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v0", 8, seed=0, **WORLD), n_steps=64, device="cpu")
+    model: Any = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v1", 8, seed=0, **WORLD), n_steps=64, device="cpu")
     model.learn(2_000)
     for policy in all_ways(model, tmp_path):
         episodes = [draw(SCENARIO, seed) for seed in range(3)]
@@ -188,17 +188,17 @@ def test_names_of_a_flat_models_fields_are_in_its_file(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_a_policy_or_a_file_is_refused(tmp_path: Path) -> None:
-    normalized: Any = PPO("MlpPolicy", VecNormalize(make_vec_env("bufgym/Uplink-v0", 2, **WORLD)), device="cpu")
+    normalized: Any = PPO("MlpPolicy", VecNormalize(make_vec_env("bufgym/Uplink-v1", 2, **WORLD)), device="cpu")
     for reads in (as_policy, weights_of):
         refuse("observes through VecNormalize .*train with norm_obs=False", reads, normalized)
-    rewards: Any = VecNormalize(make_vec_env("bufgym/Uplink-v0", 2, **WORLD), norm_obs=False)
+    rewards: Any = VecNormalize(make_vec_env("bufgym/Uplink-v1", 2, **WORLD), norm_obs=False)
     assert as_policy(PPO("MlpPolicy", rewards, device="cpu")).compile
     nameless: Any = model_of(PPO, env={"fields": ["rate_short"]})
     del nameless.observation_space.fields  # as of a wrapper that makes a space of its own
     refuse(
         r"observes 28 numbers: must be the 29 of .* for L = 1; of candidates 21 or 27, and further", as_policy, nameless
     )
-    recurrent: Any = RecurrentPPO("MlpLstmPolicy", make_vec_env("bufgym/Uplink-v0", 2, **WORLD), device="cpu")
+    recurrent: Any = RecurrentPPO("MlpLstmPolicy", make_vec_env("bufgym/Uplink-v1", 2, **WORLD), device="cpu")
     refuse("recurrent", as_policy, recurrent)
     refuse("only networks of PPO", weights_of, recurrent)
     recurrent.save(tmp_path / "lstm.zip")

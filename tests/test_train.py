@@ -49,10 +49,10 @@ def curve_of(folder: Path) -> list[float]:
     return [steps for (steps,) in columns(folder / "curve.csv", "steps")]
 
 
-@pytest.mark.parametrize("env", ["bufgym/Uplink-v0", pytest.param("bufgym/Interruption-v0", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("env", ["bufgym/Uplink-v1", pytest.param("bufgym/Interruption-v1", marks=pytest.mark.nightly)])
 def test_a_run_leaves_its_results(env: str, capsys: Capsys) -> None:
     plain = "Inter" in env
-    on = Environment("bufgym/Interruption-v0", 3, episodes=3) if plain else dataclasses.replace(ON, duration_s=3.0)
+    on = Environment("bufgym/Interruption-v1", 3, episodes=3) if plain else dataclasses.replace(ON, duration_s=3.0)
     train.main(dataclasses.replace(TINY, environment=on, steps=128))
     folder = Path("runs/tiny")
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
@@ -280,7 +280,7 @@ def test_the_command_of_a_run_gives_its_settings_again() -> None:
         TINY.command == "python train.py ppo --steps 512 --validate-every 250000 --validation-episodes 2 "
         "--capacity 3 --episodes 3 --width 8 --num-envs 4"
     )
-    refuse("its messages have no size", Environment, "bufgym/Interruption-v0", size_bytes=5)
+    refuse("its messages have no size", Environment, "bufgym/Interruption-v1", size_bytes=5)
 
 
 def test_without_words_two_ways_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,7 @@ def test_the_program_runs(package: str, tmp_path: Path) -> None:
     python = interpreter(package)
     if python is None:
         pytest.skip(needs("torchrl" if package == "torchrl" else "trainers", package))
-    path = os.pathsep.join(str(REPO / part) for part in ("", "packages/live", "packages/papers"))
+    path = os.pathsep.join(str(REPO / part) for part in ("", "packages/robot", "packages/papers"))
     where = os.environ | {"PYTHONPATH": path, "MINARI_DATASETS_PATH": str(tmp_path / "data"), "OMP_NUM_THREADS": "1"}
     command = [python, str(PROGRAMS[package])]
     done = subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)

@@ -48,10 +48,14 @@ class Version:
     """Description of the environment, or of the change."""
 
 
+_PAIRED = (
+    Version("v1", "0.3.0", "the default reward is `paired`, H above that of always dropping the cheapest"),
+    Version("v0", "0.1.0", "first version, with the default reward `retained`"),
+)
 HISTORY = {
-    "bufgym/Interruption-v0": (Version("v0", "0.1.0", "first version"),),
-    "bufgym/Uplink-v0": (Version("v0", "0.1.0", "first version"),),
-    "bufgym/Suite-v0": (Version("v0", "0.1.0", "first version"),),
+    "bufgym/Interruption-v1": _PAIRED,
+    "bufgym/Uplink-v1": _PAIRED,
+    "bufgym/Suite-v1": _PAIRED,
     "bufgym/Topics-v0": (Version("v0", "0.1.0", "first version"),),
     FLEET: (Version("v0", "0.1.0", "first version"),),
     "bufgym/Mapping-v0": (Version("v0", "0.3.0", "first version"),),

@@ -171,11 +171,11 @@ def _titled(name: str, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 FILMS: dict[str, Film] = {
     "fading-link": Film(
-        "bufgym/Uplink-v0", "a link fades and comes back: Drop Oldest beside the learned agent", _readme
+        "bufgym/Uplink-v1", "a link fades and comes back: Drop Oldest beside the learned agent", _readme
     ),
-    "interruption": Film("bufgym/Interruption-v0", "one interruption: which messages stay queued", _interruption),
-    "uplink": Film("bufgym/Uplink-v0", "a camera on a driving robot over LTE", _uplink),
-    "suite": Film("bufgym/Suite-v0", "a blackout of ten seconds, from the suite outage-v1", _suite),
+    "interruption": Film("bufgym/Interruption-v1", "one interruption: which messages stay queued", _interruption),
+    "uplink": Film("bufgym/Uplink-v1", "a camera on a driving robot over LTE", _uplink),
+    "suite": Film("bufgym/Suite-v1", "a blackout of ten seconds, from the suite outage-v1", _suite),
     "topics": Film("bufgym/Topics-v0", "eight topics over one uplink: Robofleet beside the rule gap-priority", _topics),
     "fleet": Film("bufgym_fleet_v0", "eight robots share one cell: Drop Oldest beside the learned agent", _fleet),
     "mapping": Film("bufgym/Mapping-v0", "a made-up room is filmed: four policies, one link", _mapping),

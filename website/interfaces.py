@@ -34,7 +34,7 @@ def candidates() -> NDArray[np.int64]:
     """The slots that the three actions mean in this queue, int64[3]."""
     arrival_us = np.arange(len(X)) * 33_333
     episode = Episode(messages(arrival_us, 1_000_000, X), Link(Trace.steps([(10.0, 1e6)], name="slow")))
-    env = gym.make("bufgym/Uplink-v0", capacity=L)
+    env = gym.make("bufgym/Uplink-v1", capacity=L)
     _, info = env.reset(options={"episode": episode})
     return np.asarray(info["slots"])
 

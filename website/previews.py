@@ -43,9 +43,9 @@ class Preview(NamedTuple):
 
 
 PREVIEWS = {
-    "bufgym/Interruption-v0": Preview("afr", 8.0, {"capacity": 8, "t_max": 300, "law": "fixed"}),
-    "bufgym/Uplink-v0": Preview("learned", 14.0, {"capacity": 8, "size_bytes": 460_800}),
-    "bufgym/Suite-v0": Preview("learned", 10.0, {"capacity": 8, "suite": "outage-v1"}, seed=5),
+    "bufgym/Interruption-v1": Preview("afr", 8.0, {"capacity": 8, "t_max": 300, "law": "fixed"}),
+    "bufgym/Uplink-v1": Preview("learned", 14.0, {"capacity": 8, "size_bytes": 460_800}),
+    "bufgym/Suite-v1": Preview("learned", 10.0, {"capacity": 8, "suite": "outage-v1"}, seed=5),
     "bufgym/Topics-v0": Preview("gap-priority", 10.0, {}),
     "bufgym/Mapping-v0": Preview("learned", 3.0, {"capacity": 8}),
     FLEET: Preview("learned", 10.0, {"robots": 8, "capacity": 8, "scale": (0.7,)}),

@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import FieldInfo, fields
 
 from bufgym.model.documented import below_fields
-from bufgym_live.relay.config import Config, Foxglove, Limits, Nats, Rule, StoreLimits, Tls, Tokens
+from bufgym_relay.config import Config, Foxglove, Limits, Nats, Rule, StoreLimits, Tls, Tokens
 from website.markdown import code, table
 
 PAGE: Final = Path(__file__).resolve().parent.parent / "docs/guide/relay-options.md"

@@ -18,7 +18,7 @@ from website.links import on_site
         ("tutorials/index.md", "own-task.py", "own-task.md"),
         ("guide/experts.md", "../../examples/offline.py", "../examples/offline.py"),
         ("cards.md", "results/agents.md", "results/agents.md"),
-        ("guide/relay.md", "../../packages/live/README.md", "../../packages/live/README.md"),  # on no page
+        ("guide/relay.md", "../../packages/relay/README.md", "../../packages/relay/README.md"),  # on no page
         ("index.md", "#start", "#start"),
         ("index.md", "https://example.org/a.md", "https://example.org/a.md"),
     ],

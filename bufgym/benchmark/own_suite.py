@@ -27,7 +27,7 @@ def suite(
     """A suite of your own, scenarios frozen by seeds: for ``compare``, ``bufgym bench --suite module:NAME`` and boards.
 
     Its splits train, validation and test have the same scenarios and other seeds, so no episode is in two of them. The
-    suite is known by its name from then on, as in ``gym.make("bufgym/Suite-v0", suite="lab-v1", split="train")``.
+    suite is known by its name from then on, as in ``gym.make("bufgym/Suite-v1", suite="lab-v1", split="train")``.
 
         lab = bufgym.suite("lab-v1", {"slow": "lte:rate_hz=10", "fast": "lte:rate_hz=30"}, capacity=[8, 16], seeds=20)
         print(bufgym.compare(["afr", "target-gap"], lab))

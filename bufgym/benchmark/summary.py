@@ -111,19 +111,8 @@ def summarise(
     # ``read`` makes sure that all met the same episodes, and orders them.
     rows = [{**dict(zip(KEY, run, strict=True)), "qoi": numbers[0]} for run, numbers in runs.items()]
     table = episodes.read(rows, baseline, against)
-    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
     cells = list(dict.fromkeys((scenario, capacity) for scenario, capacity, *_ in runs))
-
-    def numbers_of(policy: str, cell: Cell) -> Numbers:
-        return np.array([runs[*cell, policy, *episode] for episode in table.episodes[cell[0]]], np.float64)
-
-    by_policy = {
-        policy: {
-            cell: statistics(numbers_of(policy, cell), numbers_of(baseline, cell), drawn[cell[0]]) for cell in cells
-        }
-        for policy in table.training_seeds
-    }
-
+    by_policy = _by_cell(runs, statistics, table, cells, baseline)
     if against:
         (ranking,) = (quantity for quantity in quantities if quantity.key == rank_by)
         quantities = (*quantities, difference(ranking.title, against))
@@ -134,16 +123,43 @@ def summarise(
 
     def standings(over: Sequence[Cell]) -> list[Standing]:
         links = links_in({scenario: table.episodes[scenario] for scenario, _ in over})
-        entries = []
-        for policy, by_cell in by_policy.items():
-            values = {}
-            for quantity in quantities:
-                pooled = (np.sum if quantity.total else np.mean)([by_cell[cell][quantity.key] for cell in over], axis=0)
-                values[quantity.key] = interval(pooled, links, within=quantity.within)
-            entries.append(Standing(policy, unranked.get(policy, ""), values))
+        entries = [
+            Standing(policy, unranked.get(policy, ""), _pooled([by_cell[cell] for cell in over], quantities, links))
+            for policy, by_cell in by_policy.items()
+        ]
         return sorted(entries, key=lambda s: (not s.ranked, math.isnan(s[rank_by].value), -s[rank_by].value, s.policy))
 
     return Summary(quantities, rank_by, standings(cells), {cell: standings([cell]) for cell in cells}, baseline)
+
+
+def _by_cell(
+    runs: Mapping[Run, Sequence[float]],
+    statistics: Statistics,
+    table: episodes.Arrays,
+    cells: Sequence[Cell],
+    baseline: str,
+) -> dict[str, dict[Cell, dict[str, Numbers]]]:
+    """Each policy's statistics of each cell: of the sample and its resamples, over the episodes of ``table``."""
+    drawn = links_drawn(table.episodes, RESAMPLES, SEED)
+
+    def numbers_of(policy: str, cell: Cell) -> Numbers:
+        return np.array([runs[*cell, policy, *episode] for episode in table.episodes[cell[0]]], np.float64)
+
+    return {
+        policy: {
+            cell: statistics(numbers_of(policy, cell), numbers_of(baseline, cell), drawn[cell[0]]) for cell in cells
+        }
+        for policy in table.training_seeds
+    }
+
+
+def _pooled(over: Sequence[Mapping[str, Numbers]], quantities: Sequence[Quantity], links: int) -> dict[str, Interval]:
+    """A policy's value and interval of each quantity over these cells, drawn from so many ``links``."""
+    values = {}
+    for quantity in quantities:
+        pooled = (np.sum if quantity.total else np.mean)([numbers[quantity.key] for numbers in over], axis=0)
+        values[quantity.key] = interval(pooled, links, within=quantity.within)
+    return values
 
 
 class Place(NamedTuple):

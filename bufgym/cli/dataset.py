@@ -25,7 +25,7 @@ def dataset(
     """Record episodes and write them as a Minari data set.
 
     Args:
-        env: Environment of one queue (default: Uplink-v0).
+        env: Environment of one queue (default: Uplink-v1).
         suite: Instead: the episodes of this suite.
         split: Of the suite.
         kind: expert, medium, mixed or random.
@@ -46,7 +46,7 @@ def dataset(
     if suite is not None:
         further |= {"suite": suite, "split": split}
     made = sets.make(
-        "bufgym/Suite-v0" if suite is not None else env or "bufgym/Uplink-v0",
+        "bufgym/Suite-v1" if suite is not None else env or "bufgym/Uplink-v1",
         kind,
         episodes,
         name=name,

@@ -18,7 +18,7 @@ FILMS = {".gif": "GIF", ".webp": "WEBP", ".png": "PNG"}  # Suffix of a film -> P
 def play(
     *,
     policies: str = "afr",
-    env: str = "Uplink-v0",
+    env: str = "Uplink-v1",
     capacity: Count = 8,
     seed: Natural = 0,
     speed: PerSecond = 5.0,

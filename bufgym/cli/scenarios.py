@@ -30,7 +30,7 @@ _MOST_FACTS = 3  # Recordings whose facts stand above a table
 DEFAULT = "lte"
 
 
-@Parameter(name="*", group=Group.create_ordered("The scenario, its stream and its link (default: bufgym/Uplink-v0's)"))
+@Parameter(name="*", group=Group.create_ordered("The scenario, its stream and its link (default: bufgym/Uplink-v1's)"))
 @dataclass(frozen=True)
 class StreamOptions:
     scenario: str | None = None

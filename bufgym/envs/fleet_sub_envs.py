@@ -25,6 +25,7 @@ class FleetSubEnvs(SubEnvs):
     """
 
     keeps_slots = True  # for a state of all fields
+    own_links = False
 
     def __init__(self, cells: int, scenario: FleetScenario, options: Options, reward: str) -> None:
         """``reward`` is "team" or "own"; that of ``options`` is its term."""
@@ -87,7 +88,7 @@ class FleetSubEnvs(SubEnvs):
 
 
 def fleet_sub_envs(
-    cells: int, scenario: FleetScenario, *, reward: str = "team", term: Any = Options.reward, **arguments: Any
+    cells: int, scenario: FleetScenario, *, reward: str = "team", term: Any = None, **arguments: Any
 ) -> FleetSubEnvs:
     """Make the sub-environments of ``cells`` cells from the arguments of a fleet's environment; see ``FleetEnv``."""
     uplink, options = read_arguments(scenario.uplink, reward=term, **{"actions": SLOTS, **arguments})

@@ -44,8 +44,9 @@ class Options:
     decide_at: str | None = None
     """When to ask: "overflow" only when the buffer is full, the default of candidates; "arrival" at every arrival, the
     default of slots."""
-    reward: str | Mapping[str, float] = "retained"
-    """A term's name, or weights by name; terms outside ``REWARD_TERMS`` take part only if named."""
+    reward: str | Mapping[str, float] | None = None
+    """A term's name, or weights by name; terms outside ``REWARD_TERMS`` take part only if named. By default "paired" of
+    one queue with a link of its own, and "retained" of several topics and of robots that share a link."""
     reference: str | Policy = "min-motion-gap"
     """The rule of ``paired``, a compiled policy or its name; "min-motion-gap" always drops the cheapest."""
     actions: str = CANDIDATES
@@ -94,6 +95,10 @@ class Options:
         from bufgym.envs.render import Window  # loaded only to draw
 
         return Window()
+
+    def reward_of(self, own_queue: bool) -> str | Mapping[str, float]:
+        """``reward``, or the default of one queue with a link of its own, or of anything else."""
+        return self.reward if self.reward is not None else ("paired" if own_queue else "retained")
 
     @property
     def acts_on_candidates(self) -> bool:

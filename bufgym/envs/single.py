@@ -35,9 +35,10 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     ``QUEUE_FIELDS`` of ``bufgym.model.observe``). Most are logarithms of ratios in [-3, 3], so they mean the same at
     every L, frame rate and size. ``observation="dict"`` gives an array for each field.
 
-    **Reward** ``retained`` by default, which charges a drop at once and adds up to H - 1 over an episode, or to 0 if
-    nothing was delivered. Other terms, or weights of several, go by name: ``bufgym.model.observe.REWARD_TERMS`` and
-    ``OWN_TERMS`` say what each pays. ``info["reward_terms"]`` has each.
+    **Reward** ``paired`` by default: what drops cost, less what they cost the rule ``reference``, which always drops
+    the cheapest, on the same episode. It adds up to H less that rule's H. Other terms, or weights of several, go
+    by name: ``bufgym.model.observe.REWARD_TERMS`` and ``OWN_TERMS`` say what each pays. ``info["reward_terms"]`` has
+    each.
 
     **Slots** ``actions="slots"`` is the other interface, for networks that score every message. Its defaults are
     ``decide_at="arrival"`` and ``observation="dict"``.
@@ -56,7 +57,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     action tries this and the queue is full, the oldest message of the lowest priority goes.
 
     The fields of ``TOPIC_FIELDS`` and the terms ``age`` and ``late`` are added. H is the weighted sum over the topics,
-    so ``retained`` adds up to H minus the weights of all topics with a delivery.
+    so ``retained``, the default there, adds up to H minus the weights of all topics with a delivery.
 
     **Episode end** ``terminated`` when the last message has left; never ``truncated``. Then ``info`` also counts
     messages as ``arrived``, ``delivered`` and ``dropped``. Every step has ``qoi``, H of the messages delivered so far.
@@ -67,7 +68,7 @@ class SenderEnv(gym.Env[Observation, np.int64]):
     of the scenario (``t_max=100``), as an object or as the text of the command line (``value="saturating:0.5"``).
 
     ``reset(options={"episode": e})`` plays the ``bufgym.scenario.Episode`` e, and ``{"trace": t, "seed": s}`` the
-    episode behind that row of ``bufgym bench``. On ``bufgym/Suite-v0`` add the row's ``scenario``; ``trace`` may be
+    episode behind that row of ``bufgym bench``. On ``bufgym/Suite-v1`` add the row's ``scenario``; ``trace`` may be
     left out, as the seed tells it. ``reset(seed=s)`` begins a different sequence of episodes.
 
     Raises ``BufgymError`` for an unfit argument, option or action, and ``ResetNeeded`` for a step before a reset or

@@ -64,6 +64,7 @@ class SubEnvs:
     """
 
     keeps_slots = False  # whether slot fields are computed even where none is observed
+    own_links = True  # whether each queue has a link of its own
 
     def __init__(self, n: int, scenario: Scenario, options: Options) -> None:
         several_topics = bool(scenario.topics)
@@ -96,7 +97,9 @@ class SubEnvs:
             self.actions_count = options.candidates + 1 + (options.asked_at == "arrival")
         self.action_space: Any = spaces.Discrete(self.actions_count)
 
-        self.weights, own_terms = reward_weights(options.reward, several_topics)
+        self.weights, own_terms = reward_weights(
+            options.reward_of(self.own_links and not several_topics), several_topics
+        )
         self.terms = terms_for(several_topics) + own_terms
         self._term_names = names = [term.name for term in self.terms]
         self.rewarded = np.zeros((n, len(names)))

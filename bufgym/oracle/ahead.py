@@ -258,6 +258,7 @@ def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
     u = max(e, c)
     if u + b > ahead.link[i, 2]:
         return -2.0
-    if u - c > ahead.link[i, 1] * b:
+    room = ahead.link[i, 1]
+    if room == 0 or u - c > room * b:
         return -1.0
     return float(ahead.gain[step_of(ahead, i, m, u + b)])

@@ -3,7 +3,7 @@
     from stable_baselines3 import PPO
     from bufgym.sb3 import as_policy, make_vec_env
 
-    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v0", 8, reward="regret"), n_steps=256).learn(200_000)
+    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v1", 8, reward="regret"), n_steps=256).learn(200_000)
     policy = as_policy(model, "mine")  # runs wherever the built-in policies do
 
 ``export`` (or ``bufgym export``) writes its network to a file that bufgym runs without torch.

@@ -6,7 +6,7 @@ it a ``gymnasium.vector.VectorEnv`` instead, so a compiled batch stays one call:
     from bufgym.sb3 import make_vec_env
     from stable_baselines3 import PPO
 
-    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v0", 8, seed=0), n_steps=256)
+    model = PPO("MlpPolicy", make_vec_env("bufgym/Uplink-v1", 8, seed=0), n_steps=256)
 """
 
 import inspect

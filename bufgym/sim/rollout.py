@@ -26,6 +26,29 @@ _SHORT = 200_000  # Arrivals times numbers read at each, for a rollout that take
 
 
 @kernel
+def ask(
+    batch: Batch,
+    i: int,
+    event: int,
+    memory: NDArray[np.float64],
+    on_arrival: Any,
+    on_departure: Any,
+    on_dequeue: Any,
+    on_send: Any,
+) -> None:
+    """Let the policy of sender ``i`` answer ``event``, or hear of a departure; ``memory`` is this sender's."""
+    buffer = view(batch, i)
+    if event == DECISION:
+        decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory))
+    elif event == DEQUEUE:
+        answer_dequeue(batch, i, on_dequeue(buffer, memory))
+    elif event == SEND:
+        answer_send(batch, i, on_send(buffer, memory))
+    else:
+        on_departure(buffer, memory)
+
+
+@kernel
 def rollout(
     batch: Batch,
     shares: Shares | None,
@@ -47,16 +70,9 @@ def rollout(
             if event == END or (event == DEPARTURE and not hears_departures):
                 continue
             i = sender_of(shares, c)
-            buffer = view(batch, i)
-            if event == DECISION:
-                decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
-                again = batch.senders[i].waiting == ARRIVAL_WAITS  # B has no room yet: the same DECISION is due again
-            elif event == DEQUEUE:
-                answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
-            elif event == SEND:
-                answer_send(batch, i, on_send(buffer, memory[i]))
-            else:
-                on_departure(buffer, memory[i])
+            ask(batch, i, event, memory[i], on_arrival, on_departure, on_dequeue, on_send)
+            # B has no room yet: the same DECISION is due again
+            again = event == DECISION and batch.senders[i].waiting == ARRIVAL_WAITS
     # What the link carried arrives, though it be after the last event: TCP loses nothing.
     for i in range(len(batch.senders)):
         credit(batch, i, FOREVER)

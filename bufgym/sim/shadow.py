@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from bufgym import policies
 from bufgym.jit import kernel, records
 from bufgym.model.buffer import MESSAGE, TOPIC
-from bufgym.sim.decisions import answer_dequeue, answer_send, decide
+from bufgym.sim.rollout import ask
 from bufgym.sim.senders import Senders
-from bufgym.sim.state import DECISION, DEPARTURE, DEQUEUE, END, LOG_ENTRY, SEND, SENDER, Batch
+from bufgym.sim.state import DECISION, DEPARTURE, END, LOG_ENTRY, SENDER, Batch
 from bufgym.sim.transition import next_event
-from bufgym.sim.view import arrival_of, view
 from bufgym.utils.errors import BufgymError
 
 
@@ -36,15 +35,7 @@ def catch_up(
     event = next_event(batch, None, i)
     while event != END and not (event == DECISION and batch.senders[i].next >= arrival):
         if event != DEPARTURE or hears_departures:
-            buffer = view(batch, i)
-            if event == DECISION:
-                decide(batch, i, on_arrival(buffer, arrival_of(batch, i), memory[i]))
-            elif event == DEQUEUE:
-                answer_dequeue(batch, i, on_dequeue(buffer, memory[i]))
-            elif event == SEND:
-                answer_send(batch, i, on_send(buffer, memory[i]))
-            else:
-                on_departure(buffer, memory[i])
+            ask(batch, i, event, memory[i], on_arrival, on_departure, on_dequeue, on_send)
         event = next_event(batch, None, i)
 
 

@@ -1,5 +1,6 @@
 """Packages beside bufgym: what each declares to add, and the message where the package is not installed."""
 
+import re
 import tomllib
 from collections.abc import Iterable
 from typing import Any, NoReturn
@@ -23,7 +24,12 @@ def absent(group: str, installed: Iterable[str]) -> dict[str, str]:
         if group not in text:
             continue
         project = tomllib.loads(text)["project"]
-        folder = f"packages/{file.stem}, in bufgym's source tree" if carried else f"-e {file.parent}"
+        beside = (re.match(r"bufgym-(\w+)", text) for text in project.get("dependencies", ()))
+        needed = [*(found[1] for found in beside if found), project["name"].removeprefix("bufgym-")]
+        if carried:
+            folder = f"{' '.join(f'packages/{one}' for one in needed)}, in bufgym's source tree"
+        else:
+            folder = " ".join(f"-e {file.parent.parent / one}" for one in needed)
         for name in project.get("entry-points", {}).get(group, {}):
             if name not in held:
                 messages[name] = f"comes with the package {project['name']}: pip install {folder}"

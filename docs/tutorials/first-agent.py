@@ -13,7 +13,7 @@ import gymnasium as gym
 
 import bufgym
 
-env = gym.make("bufgym/Interruption-v0", capacity=8, t_max=200)
+env = gym.make("bufgym/Interruption-v1", capacity=8, t_max=200)
 observation, info = env.reset(seed=2)
 print(env.action_space)  # drop the cheapest candidate, the second cheapest, or the head
 print(observation.shape)
@@ -37,7 +37,7 @@ from stable_baselines3 import PPO
 
 from bufgym.sb3 import as_policy, make_vec_env
 
-envs = make_vec_env("bufgym/Interruption-v0", 8, seed=0, capacity=8, t_max=200)
+envs = make_vec_env("bufgym/Interruption-v1", 8, seed=0, capacity=8, t_max=200)
 model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu")
 model.learn(32_768)
 

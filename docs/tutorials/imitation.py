@@ -18,7 +18,7 @@ from bufgym.envs import expert
 
 TRAIN = [f"lte-synthetic-{k}" for k in range(6)]
 envs = gym.make_vec(
-    "bufgym/Uplink-v0",
+    "bufgym/Uplink-v1",
     64,
     capacity=8,
     duration_s=10.0,

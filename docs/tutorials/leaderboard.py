@@ -7,7 +7,7 @@
 #
 # ## Training on a suite
 #
-# A suite is frozen: its scenarios, capacities and episodes never change. `Suite-v0` draws from the split that you name;
+# A suite is frozen: its scenarios, capacities and episodes never change. `Suite-v1` draws from the split that you name;
 # episodes of the test split do not occur in training.
 
 # %%
@@ -19,7 +19,7 @@ from bufgym.sb3 import make_vec_env
 
 folder = Path("mine")
 folder.mkdir(exist_ok=True)
-envs = make_vec_env("bufgym/Suite-v0", 8, seed=0, suite="interruption-v1", split="train", capacity=10)
+envs = make_vec_env("bufgym/Suite-v1", 8, seed=0, suite="interruption-v1", split="train", capacity=10)
 model = PPO("MlpPolicy", envs, n_steps=256, seed=0, device="cpu").learn(32_768)
 model.save(folder / "my-agent.zip")
 

@@ -85,7 +85,7 @@ import bufgym
 
 task = {"scenario": "between-halls", "capacity": 8}
 task["fields"] = ["occupied", "rank", "loss", "staleness", "occupancy", "busy", "left", "service_ratio"]
-env = gym.make("bufgym/Uplink-v0", reward={"retained": 1.0, "waited": 5.0}, **task, actions="slots")
+env = gym.make("bufgym/Uplink-v1", reward={"retained": 1.0, "waited": 5.0}, **task, actions="slots")
 env.reset(seed=0)
 _, reward, _, _, info = env.step(env.action_space.n - 1)  # accept
 print(reward, info["reward_terms"])
@@ -103,7 +103,7 @@ from bufgym.sb3 import SlotPolicy, make_vec_env
 
 def train(weight):
     envs = make_vec_env(
-        "bufgym/Uplink-v0", 64, seed=0, reward={"retained": 1.0, "waited": weight}, **task, actions="slots"
+        "bufgym/Uplink-v1", 64, seed=0, reward={"retained": 1.0, "waited": weight}, **task, actions="slots"
     )
     settings = {"n_steps": 64, "batch_size": 1024, "n_epochs": 4, "learning_rate": 3e-3, "gamma": 0.95}
     return MaskablePPO(SlotPolicy, envs, seed=0, **settings).learn(81_920)
@@ -122,7 +122,7 @@ import matplotlib.pyplot as plt
 
 from bufgym.envs import expert
 
-envs = gym.make_vec("bufgym/Uplink-v0", 20, reward={"retained": 1.0, "waited": 0.0}, **task, actions="slots")
+envs = gym.make_vec("bufgym/Uplink-v1", 20, reward={"retained": 1.0, "waited": 0.0}, **task, actions="slots")
 figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
 for name in (*agents, "min-gap", "afr", "drop-oldest"):
     observation, info = envs.reset(seed=100)

@@ -1,7 +1,7 @@
 """An ordinary rospy node, which knows nothing of bufgym: a camera of 230 kB frames at 30 Hz.
 
 python3 camera.py --frames 600
-python3 -m bufgym_live.robot.ros1 --policy afr camera.py --frames 600
+python3 -m bufgym_robot.ros1 --policy afr camera.py --frames 600
 """
 
 import argparse

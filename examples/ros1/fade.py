@@ -1,7 +1,7 @@
 """Frames of a rospy camera that arrive over a fading link, with rospy's own queue and under policies.
 
 ``examples/fade.py`` defines link and stream. The node is the unmodified ``camera.py``. The subscriber is rospy's and
-connects through ``bufgym_live.robot.ShapedLink``. The same policies also run in the simulator. Run it with a Python
+connects through ``bufgym_robot.ShapedLink``. The same policies also run in the simulator. Run it with a Python
 that has rospy, rosmaster and bufgym:
 
     python3 examples/ros1/fade.py --policies rospy,drop-oldest,afr
@@ -38,7 +38,7 @@ from fade import (
 )
 
 from bufgym.model import Link
-from bufgym_live.robot import ShapedLink
+from bufgym_robot import ShapedLink
 
 PORT = 11399
 """Port of the master in a namespace of its own."""
@@ -95,7 +95,7 @@ def one(policy: str, seconds: float) -> dict[str, Any]:
     master.start()
     port = master.master_node.server.socket.getsockname()[1]
     os.environ.update(ROS_MASTER_URI=f"http://127.0.0.1:{port}", ROS_IP="127.0.0.1", PYTHONWARNINGS="ignore")
-    run_by = [] if policy == "rospy" else ["-m", "bufgym_live.robot.ros1", "--policy", policy]
+    run_by = [] if policy == "rospy" else ["-m", "bufgym_robot.ros1", "--policy", policy]
     frames = round(seconds * RATE_HZ)
     camera = subprocess.Popen([sys.executable, *run_by, str(CAMERA), "--frames", str(frames)], stdout=sys.stderr)
     try:
@@ -115,7 +115,7 @@ def one(policy: str, seconds: float) -> dict[str, Any]:
 def through_the_kernel(policy: str, seconds: float) -> dict[str, Any]:
     """The same with two network namespaces, `tc tbf` and 200 kB of queue as the link. Takes root on Linux."""
     master = f"from rosmaster.master import Master; import time; Master({PORT}).start(); time.sleep({seconds + 100})"
-    run_by = [] if policy == "rospy" else ["-m", "bufgym_live.robot.ros1", "--policy", policy]
+    run_by = [] if policy == "rospy" else ["-m", "bufgym_robot.ros1", "--policy", policy]
     camera = [*run_by, str(CAMERA), "--frames", str(round(seconds * RATE_HZ))]
     place = {**os.environ, "ROS_MASTER_URI": f"http://{ADDRESSES[0]}:{PORT}", "PYTHONWARNINGS": "ignore"}
     robot, base = {**place, "ROS_IP": ADDRESSES[0]}, {**place, "ROS_IP": ADDRESSES[1]}

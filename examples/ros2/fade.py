@@ -1,6 +1,6 @@
 """Frames of a ROS 2 camera that arrive over a fading link, by DDS itself and by the relay under policies.
 
-``examples/fade.py`` defines the link. The relay's uplink goes through ``bufgym_live.robot.ShapedLink``; robot and
+``examples/fade.py`` defines the link. The relay's uplink goes through ``bufgym_robot.ShapedLink``; robot and
 viewer are in two DDS domains. ``best-effort`` and ``reliable`` are DDS itself, between two network namespaces with
 `tc tbf` and 200 kB of queue, which takes root on Linux.
 
@@ -37,7 +37,7 @@ from fade import (
 )
 
 from bufgym.model import Link
-from bufgym_live.robot import ShapedLink
+from bufgym_robot import ShapedLink
 
 DOMAIN = 20 + os.getpid() % 40 * 2
 """DDS domain; the next one is used too. Each process has its own, because two may run at a time."""

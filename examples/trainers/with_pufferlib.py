@@ -14,7 +14,7 @@ import bufgym  # noqa: F401  (registers the environments)
 
 
 def made(**buffers):
-    env = gym.make("bufgym/Uplink-v0", capacity=8, reward="regret", info="mask")
+    env = gym.make("bufgym/Uplink-v1", capacity=8, reward="regret", info="mask")
     return pufferlib.emulation.GymnasiumPufferEnv(env, **buffers)
 
 

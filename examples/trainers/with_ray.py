@@ -4,7 +4,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 
 config = (
     PPOConfig()
-    .environment("bufgym:bufgym/Uplink-v0", env_config={"capacity": 8, "reward": "regret"})
+    .environment("bufgym:bufgym/Uplink-v1", env_config={"capacity": 8, "reward": "regret"})
     .env_runners(num_env_runners=1)
     .training(train_batch_size_per_learner=2_000, minibatch_size=250, num_epochs=2)
 )

@@ -6,7 +6,7 @@ from skrl.utils.runner.torch import Runner
 
 import bufgym  # noqa: F401  (registers the environments)
 
-envs = wrap_env(gym.make_vec("bufgym/Uplink-v0", num_envs=8, capacity=8, reward="regret"))
+envs = wrap_env(gym.make_vec("bufgym/Uplink-v1", num_envs=8, capacity=8, reward="regret"))
 part = {
     "class": "CategoricalMixin",
     "network": [{"name": "net", "input": "OBSERVATIONS", "layers": [64], "activations": "tanh"}],

@@ -13,7 +13,7 @@ import bufgym  # noqa: F401  (registers the environments)
 
 
 def made():
-    return gym.make("bufgym/Uplink-v0", capacity=8, reward="regret", info="mask")
+    return gym.make("bufgym/Uplink-v1", capacity=8, reward="regret", info="mask")
 
 
 space, actions = made().observation_space, made().action_space

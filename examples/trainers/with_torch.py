@@ -10,7 +10,7 @@ from torch.distributions import Categorical
 
 import bufgym  # noqa: F401  (registers the environments)
 
-envs = gym.make_vec("bufgym/Uplink-v0", num_envs=64, capacity=8, reward="regret", autoreset_mode="SameStep")
+envs = gym.make_vec("bufgym/Uplink-v1", num_envs=64, capacity=8, reward="regret", autoreset_mode="SameStep")
 inputs, actions = envs.single_observation_space.shape[0], int(envs.single_action_space.n)
 actor = nn.Sequential(nn.Linear(inputs, 64), nn.Tanh(), nn.Linear(64, actions))
 optimizer = torch.optim.Adam(actor.parameters(), 1e-3)

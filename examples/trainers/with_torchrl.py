@@ -12,7 +12,7 @@ from torchrl.objectives.value import GAE
 
 import bufgym  # noqa: F401  (registers the environments)
 
-env = GymEnv("bufgym/Uplink-v0", categorical_action_encoding=True, capacity=8, reward="regret")
+env = GymEnv("bufgym/Uplink-v1", categorical_action_encoding=True, capacity=8, reward="regret")
 check_env_specs(env)
 
 

@@ -37,7 +37,7 @@ def played(env: Any, player: Player, episode: Any) -> dict[str, Any]:
 @pytest.mark.parametrize("name", PLAYABLE)
 @pytest.mark.parametrize("scenario", [Interruption(t_max=40), GAPPY], ids=["interruption", "uplink"])
 def test_a_player_in_the_environment_does_what_the_benchmark_does(name: str, scenario: Any) -> None:
-    env: Any = gym.make("bufgym/Uplink-v0", scenario=scenario, capacity=3, actions="slots").unwrapped
+    env: Any = gym.make("bufgym/Uplink-v1", scenario=scenario, capacity=3, actions="slots").unwrapped
     for row in run([policies.get(name)], scenario, [3], 2):
         info = played(env, Player(policies.get(name)), draw(scenario, row["seed"]))
         assert (info["delivered"], info["qoi"]) == (row["delivered"], pytest.approx(row["qoi"]))
@@ -55,7 +55,7 @@ def test_a_player_of_topics_reaches_what_its_policy_reaches(name: str) -> None:
 
 
 def test_a_player_refuses_a_decision_that_means_nothing() -> None:
-    env: Any = gym.make("bufgym/Interruption-v0", capacity=3, actions="slots").unwrapped
+    env: Any = gym.make("bufgym/Interruption-v1", capacity=3, actions="slots").unwrapped
     env.reset(seed=0)
     for decision, says in ((3, "decision 3"), (None, "on_arrival returned None: must be a whole number")):
         with pytest.raises(BufgymError, match=f"policy odd: {says}"):

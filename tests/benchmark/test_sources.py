@@ -79,7 +79,7 @@ def test_functions_makers_and_policies_of_a_module(module: str, capsys: Capsys) 
     assert table["newest"] == table["made-here"] == table["whole"] == table["drop-oldest"]
     assert table["every"] != table["every:every=3"]
     assert sources.load(f"{module}:makes_a_function") == "newest"  # as there is already
-    shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v0", "--speed", "1000"], capsys)
+    shown(["play", "--policies", f"{module}:newest", "--env", "Interruption-v1", "--speed", "1000"], capsys)
 
 
 def test_a_learned_policys_file_goes_by_its_stem(module: str, capsys: Capsys) -> None:

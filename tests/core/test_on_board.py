@@ -236,7 +236,7 @@ def test_what_arrives_counts_although_it_is_not_kept():
     assert loads[3][1] == pytest.approx(2_765.625 / 3_765.625)
 
 
-@pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
+@pytest.mark.parametrize("id", ["bufgym/Uplink-v1", "bufgym/Topics-v0"])
 def test_environments_observe_them_where_they_are_named(id):
     env = gym.make(id, fields=["rank", *BYTE_FIELDS], capacity=4, observation="dict")
     _, info = env.reset(seed=1)

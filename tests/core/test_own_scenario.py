@@ -79,7 +79,7 @@ class Steady:
 def test_a_registered_scenario_is_one_like_the_others() -> None:
     scenario.register("steady-ten")(Steady)
     assert SCENARIOS["steady-ten"][1] == "Ten messages over a steady link."
-    env = gym.make("bufgym/Uplink-v0", scenario="steady-ten", capacity=2, actions="slots")
+    env = gym.make("bufgym/Uplink-v1", scenario="steady-ten", capacity=2, actions="slots")
     _, info = env.reset(seed=0)
     ended = False
     while not ended:
@@ -91,7 +91,7 @@ def test_a_registered_scenario_is_one_like_the_others() -> None:
 
 def test_a_spec_as_text_brings_its_own(module: str) -> None:
     arguments = {"scenario": f"{module}:short", "value": f"{module}:doorways"}
-    spec = gym.make("bufgym/Interruption-v0", **arguments, actions="slots").spec  # type: ignore[arg-type]
+    spec = gym.make("bufgym/Interruption-v1", **arguments, actions="slots").spec  # type: ignore[arg-type]
     assert spec is not None
     sub_envs = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json())).unwrapped.sub_envs  # type: ignore[attr-defined]
     assert sub_envs.scenario.t_max == 9 and sub_envs.scenario.value.name == f"{module}:doorways"

@@ -13,9 +13,9 @@ from bufgym.scenario import Client, Stream
 from bufgym.traces import Trace
 
 SMALL: dict[str, dict[str, Any]] = {
-    "bufgym/Interruption-v0": {"t_max": 20},
-    "bufgym/Uplink-v0": {"duration_s": 1.0},
-    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+    "bufgym/Interruption-v1": {"t_max": 20},
+    "bufgym/Uplink-v1": {"duration_s": 1.0},
+    "bufgym/Suite-v1": {"suite": "interruption-v1"},
     "bufgym/Topics-v0": {"duration_s": 1.0},
 }
 """Arguments that make episodes of every environment short."""

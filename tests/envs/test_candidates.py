@@ -172,13 +172,13 @@ def test_actions_do_what_the_slot_actions_do() -> None:
 
 
 def test_the_defaults_of_each_kind_of_environment() -> None:
-    env = gym.make("bufgym/Uplink-v0")
+    env = gym.make("bufgym/Uplink-v1")
     assert (env.action_space, env.observation_space.shape) == (gym.spaces.Discrete(3), (27,))
     assert env.unwrapped.sub_envs.senders.decide_at == "overflow"
-    slots = gym.make("bufgym/Uplink-v0", actions="slots")
+    slots = gym.make("bufgym/Uplink-v1", actions="slots")
     assert (slots.action_space, slots.unwrapped.sub_envs.senders.decide_at) == (gym.spaces.Discrete(10), "arrival")
     assert gym.make("bufgym/Topics-v0").action_space == gym.spaces.Discrete(34)
-    named = gym.make("bufgym/Uplink-v0", candidates=3, decide_at="arrival", observation="dict")
+    named = gym.make("bufgym/Uplink-v1", candidates=3, decide_at="arrival", observation="dict")
     assert named.action_space == gym.spaces.Discrete(5) and named.observation_space["candidate_merged"].shape == (4,)
 
 
@@ -283,6 +283,18 @@ def test_regret_is_the_same_alone_and_in_a_batch() -> None:
         assert both[4]["reward_terms"]["regret"][1] == alone[4]["reward_terms"]["regret"] == alone[1]
 
 
+@kernels
+def test_where_no_message_has_room_nothing_is_given_up() -> None:
+    """B is a byte short of a message, so nothing is sent whatever one does: V* is 0 from the start."""
+    env = SenderEnv(SHORT, 3, reward="regret", max_bytes=SHORT.size_bytes - 1, decide_at="arrival")
+    env.reset(seed=0)
+    ended, rewards = False, []
+    while not ended:
+        _, reward, ended, *_ = env.step(0)
+        rewards.append(reward)
+    assert not any(rewards)
+
+
 def test_an_episode_without_a_decision_gives_up_nothing() -> None:
     episode = Episode(messages(np.arange(4) * 1_000_000, 10), Link(Trace.steps([(100.0, 1000.0)])))
     env = SenderEnv(Interruption(t_max=20), 3, reward="regret")
@@ -294,7 +306,7 @@ def test_an_episode_without_a_decision_gives_up_nothing() -> None:
 @kernels
 @pytest.mark.parametrize("actions", ["candidates", "slots"])
 @pytest.mark.parametrize(
-    ("name", "more"), [("Uplink-v0", {}), ("Interruption-v0", {}), ("Suite-v0", {"suite": "generated-v1"})]
+    ("name", "more"), [("Uplink-v1", {}), ("Interruption-v1", {}), ("Suite-v1", {"suite": "generated-v1"})]
 )
 def test_rewards_and_the_bound_have_one_clairvoyant(name: str, more: dict[str, Any], actions: str) -> None:
     """Default environments: ``regret`` sums to H less the H that ``bound`` names, the first step's loss included."""

@@ -177,6 +177,35 @@ def test_robots_of_a_cell_learn_from_their_cost() -> None:
             over |= ended
 
 
+def test_the_default_reward() -> None:
+    """``paired`` where each queue has a link of its own: always the cheapest earns 0. Elsewhere ``retained``."""
+    alone = SenderEnv(EQUAL, L)
+    alone.reset(seed=0)
+    rewards, ended = [], False
+    while not ended:
+        _, reward, ended, _, info = alone.step(0)
+        rewards.append(reward)
+    assert rewards == [0] * len(rewards) and info["reward_terms"]["paired"] == 0
+    others: Any = (gym.make("bufgym/Topics-v0"), FleetVecEnv(1, 2, EQUAL, L, reward="own", autoreset_mode="SameStep"))
+    for env in others:
+        env.reset(seed=0)
+        _, reward, _, _, info = env.step(env.action_space.sample() * 0)
+        assert np.array_equal(reward, info["reward_terms"]["retained"]) and "paired" not in info["reward_terms"]
+
+
+@pytest.mark.parametrize("name", ["Uplink", "Interruption", "Suite"])
+def test_the_version_before_differs_in_its_reward_alone(name: str) -> None:
+    with pytest.warns(DeprecationWarning, match="upgrading to version `v1`"):
+        before = gym.make(f"bufgym/{name}-v0")
+    now = gym.make(f"bufgym/{name}-v1")
+    assert np.array_equal(before.reset(seed=3)[0], now.reset(seed=3)[0])
+    for action in (0, 1, 2, 1):
+        seen, reward, ended, _, info = before.step(action)
+        assert np.array_equal(seen, now.step(action)[0]) and reward == info["reward_terms"]["retained"]
+        if ended:
+            break
+
+
 PLAIN = policies.Policy("plain-python", lambda buffer, arrival, memory: policies.ACCEPT)
 test_wrong_use = refused(
     (lambda: SenderEnv("lte", reward="paired", reference="afrr"), "unknown policy 'afrr'"),

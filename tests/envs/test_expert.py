@@ -158,7 +158,7 @@ def judged(scenario: str = "lte", **options: Any) -> Any:
 test_where_one_is_not_known_it_says_so = refused(
     (lambda: judged("topics"), "several topics"),
     (lambda: judged(size_cv=0.5), "for equal sizes only"),
-    (lambda: expert.online(SenderEnv(SHORT, 2, actions="slots")), "Interruption-v0, not for Uplink"),
+    (lambda: expert.online(SenderEnv(SHORT, 2, actions="slots")), "Interruption-v1, not for Uplink"),
     (lambda: expert.policy(gym.make("CartPole-v1"), "afr"), "no environment of bufgym"),
 )
 
@@ -172,7 +172,7 @@ def test_a_policy_reaches_what_its_rollout_reaches(name: str) -> None:
     n, family = 5, Interruption(t_max=50)
     drawn = [draw(family, seed) for seed in range(2 * n)]
     reached = run(known, drawn, 3, family.value)
-    envs: Any = gym.make_vec("bufgym/Interruption-v0", n, capacity=3, scenario=family, actions="slots").unwrapped
+    envs: Any = gym.make_vec("bufgym/Interruption-v1", n, capacity=3, scenario=family, actions="slots").unwrapped
     envs.reset(options={"episodes": drawn[:n]})
     asked, last = expert.policy(envs, policy), np.zeros(2 * n)
     for half in (0, n):
@@ -237,7 +237,7 @@ def test_what_is_recorded_can_be_played_again(kind: str) -> None:
 
 def test_a_data_set_recovers_its_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     minari = pytest.importorskip("minari", reason=needs("extras", "minari"))
-    command = ["dataset", "make", "--env", "Interruption-v0", "--kind", "mixed", "--episodes", "7", "--capacity", "3"]
+    command = ["dataset", "make", "--env", "Interruption-v1", "--kind", "mixed", "--episodes", "7", "--capacity", "3"]
     command += ["--option", "t_max=20", "--option", "value=saturating:0.5", "--out", str(tmp_path)]
     assert main(command) == 0
     assert "bufgym/interruption/mixed-v0: 7 episodes" in capsys.readouterr().out
@@ -260,9 +260,9 @@ def test_what_fails_leaves_nothing(tmp_path: Path) -> None:
     pytest.importorskip("minari", reason=needs("extras", "minari"))
     from bufgym.envs.expert import dataset
 
-    refuse("for equal sizes only", dataset.make, "Uplink-v0", "random", 2, out=tmp_path, size_cv=0.5, **STREAM)
+    refuse("for equal sizes only", dataset.make, "Uplink-v1", "random", 2, out=tmp_path, size_cv=0.5, **STREAM)
     with pytest.raises(BufgymError, match="must be of the form"):
-        dataset.make("Uplink-v0", "random", 2, out=tmp_path, name="no version!", regret=False, **STREAM)
+        dataset.make("Uplink-v1", "random", 2, out=tmp_path, name="no version!", regret=False, **STREAM)
     assert not [path for path in tmp_path.iterdir() if path.is_dir() and path.name != "bufgym"]
 
 

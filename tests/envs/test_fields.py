@@ -14,7 +14,7 @@ from bufgym.traces import Trace
 from bufgym.utils.errors import BufgymError
 
 L, N = 4, 3
-SETTING: dict[str, Any] = {"capacity": L, **SMALL["bufgym/Uplink-v0"]}
+SETTING: dict[str, Any] = {"capacity": L, **SMALL["bufgym/Uplink-v1"]}
 RNG = np.random.default_rng(7)
 SUBSETS = [[name] for name in BUILT_IN]
 SUBSETS += [RNG.choice(list(BUILT_IN), size, replace=False).tolist() for size in (2, 4, 4, 8, 16, len(BUILT_IN))]

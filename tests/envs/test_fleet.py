@@ -30,7 +30,7 @@ PARAMETERS = {"duration_s": 2.0, "size_bytes": 600_000}
 
 @pytest.mark.parametrize("actions", [{"actions": "slots"}, {"actions": "candidates", "candidates": 3}])
 def test_one_robot_is_the_single_environment(actions):
-    fleet, single = FleetEnv(robots=1, **SMALL, **actions), SenderEnv(**SMALL, **actions)
+    fleet, single = FleetEnv(robots=1, **SMALL, **actions), SenderEnv(reward="retained", **SMALL, **actions)
     assert fleet.action_space("robot_0") == single.action_space
     rng = np.random.default_rng(0)
     seen, infos = fleet.reset(seed=3)

@@ -64,7 +64,7 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
     rows = run_sweep(Sweep(mixed, PLAYED), tmp_path, backend="sequential", form="csv", progress=False)
     assert len(rows) == 2 * 2 * 2 * (len(PLAYED) + 1)  # and AFR
     rows = [row for row in rows if row["policy"] in PLAYED]
-    env = gym.make("bufgym/Suite-v0", suite=mixed, split="test", capacity=L, bound=True, actions="slots")
+    env = gym.make("bufgym/Suite-v1", suite=mixed, split="test", capacity=L, bound=True, actions="slots")
     infos = []
     for row in rows:
         numbers = {name: row[name] for name in ("scenario", "trace", "seed")}
@@ -77,7 +77,7 @@ def test_the_numbers_of_a_row_lead_to_its_episode(mixed: str, tmp_path: Path) ->
         assert played(env, row["policy"], options=numbers)["qoi"] == info["qoi"]
     assert len({round(info["qoi"], 9) for info in infos}) > 8  # they differ
     envs: Any = gym.make_vec(
-        "bufgym/Suite-v0", len(rows), suite=mixed, split="test", capacity=L, bound=True, actions="slots"
+        "bufgym/Suite-v1", len(rows), suite=mixed, split="test", capacity=L, bound=True, actions="slots"
     )
     _, _ = envs.reset(options={"episodes": [{k: row[k] for k in ("scenario", "trace", "seed")} for row in rows]})
     players = {name: Player(policies.get(name), len(rows)) for name in PLAYED}
@@ -106,7 +106,7 @@ def test_the_rows_of_a_bench_without_a_suite_are_found_too() -> None:
 
 
 def suite_env(**arguments: Any) -> Any:
-    return gym.make("bufgym/Suite-v0", **arguments, actions="slots")
+    return gym.make("bufgym/Suite-v1", **arguments, actions="slots")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_no_such_episode_or_suite(mixed: str, act: Any, says: str) -> None:
 def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, score: float) -> None:
     """L = 1, V(d) = 1 - 0.5^d, an interruption of T messages."""
     given: dict[str, Any] = {"law": "fixed", "t_max": T, "value": "exponential:0.5", "disable_env_checker": True}
-    env = gym.make("bufgym/Interruption-v0", capacity=1, bound=True, **given, actions="slots")
+    env = gym.make("bufgym/Interruption-v1", capacity=1, bound=True, **given, actions="slots")
     env.reset(seed=0)
     ended, info, first = False, {}, action != 1
     while not ended:
@@ -178,12 +178,12 @@ def test_the_bound_worked_by_hand(T: int, action: int, h: float, best: float, sc
 
 
 TEXTS: list[tuple[str, dict[str, Any], dict[str, Any]]] = [
-    ("bufgym/Interruption-v0", {"value": "saturating:4"}, {"value": qoi.saturating(4)}),
-    ("bufgym/Uplink-v0", {"traces": "lte-synthetic-3", "motion": "drive-1"}, {}),
-    ("bufgym/Uplink-v0", {"traces": ["lte-synthetic-3", "lte-synthetic-0"], "motion": "none", "scale": [0.5, 2]}, {}),
+    ("bufgym/Interruption-v1", {"value": "saturating:4"}, {"value": qoi.saturating(4)}),
+    ("bufgym/Uplink-v1", {"traces": "lte-synthetic-3", "motion": "drive-1"}, {}),
+    ("bufgym/Uplink-v1", {"traces": ["lte-synthetic-3", "lte-synthetic-0"], "motion": "none", "scale": [0.5, 2]}, {}),
     ("bufgym/Topics-v0", {"traces": "lte-synthetic-3", "motion": ["drive-0"], "value": "exponential:0.5"}, {}),
     ("bufgym/Topics-v0", {"scenario": "examples/client.toml"}, {}),
-    ("bufgym/Suite-v0", {"suite": "interruption-v1", "split": "validation"}, {}),
+    ("bufgym/Suite-v1", {"suite": "interruption-v1", "split": "validation"}, {}),
 ]
 
 
@@ -208,7 +208,7 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
     write_csv(Trace.steps([(1.0, 500_000), (2.0, 0)]), tmp_path / "mine.csv")
     (tmp_path / "recording.csv").write_text("time_s,bytes\n0,1000\n0.5,2000\n1,500\n")
     env: Any = gym.make(
-        "bufgym/Uplink-v0",
+        "bufgym/Uplink-v1",
         traces=str(tmp_path / "mine.csv"),
         workload=str(tmp_path / "recording.csv"),
         motion="none",
@@ -219,7 +219,7 @@ def test_text_may_name_a_file(tmp_path: Path) -> None:
 
 
 def uplink(**arguments: Any) -> Any:
-    return gym.make("bufgym/Uplink-v0", **arguments, actions="slots")
+    return gym.make("bufgym/Uplink-v1", **arguments, actions="slots")
 
 
 test_text_that_names_nothing = refused(
@@ -232,9 +232,9 @@ test_text_that_names_nothing = refused(
 
 
 SLOW: dict[str, dict[str, Any]] = {
-    "bufgym/Interruption-v0": {"t_max": 30},
-    "bufgym/Uplink-v0": {"duration_s": 4.0, "size_bytes": 1_000_000},
-    "bufgym/Suite-v0": {"suite": "interruption-v1"},
+    "bufgym/Interruption-v1": {"t_max": 30},
+    "bufgym/Uplink-v1": {"duration_s": 4.0, "size_bytes": 1_000_000},
+    "bufgym/Suite-v1": {"suite": "interruption-v1"},
 }
 
 

@@ -78,7 +78,7 @@ def test_every_step_of_the_environment_is_the_same(one_file: ModuleType) -> None
     steps, drops = 0, [0, 0, 0]
     for seed in EPISODES:
         episode, capacity, v = drawn(seed)
-        env = SenderEnv(Interruption(value=v), capacity)
+        env = SenderEnv(Interruption(value=v), capacity, reward="retained")
         plain = one_file.QueueEnv(lambda rng, seed=seed: sender(one_file, seed))
         (seen, info), (plain_seen, plain_info) = env.reset(options={"episode": episode}), plain.reset(seed=seed)
         rng, ended, total = np.random.default_rng(seed), False, 1.0

@@ -161,7 +161,7 @@ def test_compiled_and_plain_agree_and_sum_to_the_log(env_id: str) -> None:
 
 @pytest.mark.kernels
 def test_a_batch_is_its_rows() -> None:
-    arguments: dict[str, Any] = {"fields": CHOSEN, "reward": ONE_QUEUE, "capacity": 3, **SMALL["bufgym/Uplink-v0"]}
+    arguments: dict[str, Any] = {"fields": CHOSEN, "reward": ONE_QUEUE, "capacity": 3, **SMALL["bufgym/Uplink-v1"]}
     singles = [SenderEnv("lte", **arguments, actions="slots") for _ in range(3)]
     batch = SenderVectorEnv(3, "lte", autoreset_mode="Disabled", **arguments, actions="slots")
     many, one = batch.reset(seed=5)[0], [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
@@ -183,12 +183,12 @@ def test_a_term_of_the_end_is_asked_once_an_episode() -> None:
         calls.append(step.ended)
         return len(step.log)
 
-    single: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="at_end", actions="slots")
+    single: Any = gym.make("bufgym/Uplink-v1", duration_s=1.0, reward="at_end", actions="slots")
     assert calls == ["ready"]
     single.reset(seed=0)
     steps = [single.step(0) for _ in range(30)]
     assert [reward for _, reward, *_ in steps] == [0.0] * 29 + [30.0] and calls == ["ready", True]
-    batch: Any = gym.make_vec("bufgym/Uplink-v0", 3, duration_s=1.0, reward="at_end", actions="slots")
+    batch: Any = gym.make_vec("bufgym/Uplink-v1", 3, duration_s=1.0, reward="at_end", actions="slots")
     batch.reset(seed=0)
     for _ in range(30):
         _, rewards, ended, *_ = batch.step(np.zeros(3, np.int64))
@@ -230,7 +230,7 @@ def test_a_spec_as_text_imports_what_it_names(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "own_text_module.py").write_text(MODULE)
     monkeypatch.chdir(tmp_path)
     arguments: dict[str, Any] = {"fields": ["rank", "own_text_module:seen"], "reward": {"own_text_module:paid": 3}}
-    spec = gym.make("bufgym/Interruption-v0", **arguments, actions="slots").spec
+    spec = gym.make("bufgym/Interruption-v1", **arguments, actions="slots").spec
     assert spec is not None
     env = gym.make(gym.envs.registration.EnvSpec.from_json(spec.to_json()))
     seen, _ = env.reset(seed=0)

@@ -24,8 +24,8 @@ def played(envs: Any, rule: str = "afr") -> list[Any]:
 
 def test_a_weight_is_a_factor_on_the_reward_and_on_nothing_else() -> None:
     """As ``docs/guide/environments.md`` has it for returns of a size that a learner likes."""
-    for id, factor in (("bufgym/Uplink-v0", 0.1), ("bufgym/Topics-v0", 0.0005)):
-        plain = played(gym.make_vec(id, 2, **SMALL[id]))
+    for id, factor in (("bufgym/Uplink-v1", 0.1), ("bufgym/Topics-v0", 0.0005)):
+        plain = played(gym.make_vec(id, 2, reward="retained", **SMALL[id]))
         scaled = played(gym.make_vec(id, 2, reward={"retained": factor}, **SMALL[id]))
         for (before, terms), (rewards, same_terms) in zip(plain, scaled, strict=True):
             np.testing.assert_allclose(rewards, factor * before, rtol=1e-12)
@@ -44,7 +44,7 @@ def test_a_weight_is_a_factor_on_the_reward_and_on_nothing_else() -> None:
     ids=["lte", "bytes", "topics", "topics-bytes"],
 )
 def test_no_episode_is_as_long_as_the_spec_says(options: dict[str, Any], choice: str) -> None:
-    env: Any = gym.make("bufgym/Uplink-v0", capacity=3, **options, actions="slots")
+    env: Any = gym.make("bufgym/Uplink-v1", capacity=3, **options, actions="slots")
     _, info = env.reset(seed=0)
     rng, fixed = np.random.default_rng(0), {"hold": 3, "accept": 4, "oldest": 0}
     steps, ended = 0, False
@@ -58,7 +58,7 @@ def test_no_episode_is_as_long_as_the_spec_says(options: dict[str, Any], choice:
 
 def test_the_time_in_the_observation() -> None:
     """T = 4 has 6 messages, of which 1 to 4 ask."""
-    plain = gym.make("bufgym/Interruption-v0", law="fixed", t_max=4, actions="slots")
+    plain = gym.make("bufgym/Interruption-v1", law="fixed", t_max=4, actions="slots")
     env: Any = TimeAwareObservation(plain, flatten=False, normalize_time=True)
     assert env.spec.max_episode_steps == 7
     seen, _ = env.reset(seed=0)
@@ -70,6 +70,6 @@ def test_the_time_in_the_observation() -> None:
 
 
 def test_an_episode_that_arguments_lengthen_is_not_cut() -> None:
-    spec = gym.make("bufgym/Uplink-v0", duration_s=40.0, actions="slots").spec
+    spec = gym.make("bufgym/Uplink-v1", duration_s=40.0, actions="slots").spec
     assert spec is not None and spec.max_episode_steps == 40 * 30 + 1
-    assert gym.spec("bufgym/Uplink-v0").max_episode_steps is None
+    assert gym.spec("bufgym/Uplink-v1").max_episode_steps is None

@@ -39,7 +39,7 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
 
 
 def make(scenario: str = "fading", **options: Any) -> SenderEnv:
-    return SenderEnv(SCENARIOS[scenario], 4, **options, actions="slots")
+    return SenderEnv(SCENARIOS[scenario], 4, **{"reward": "retained", **options}, actions="slots")
 
 
 def begun(**options: Any) -> SenderEnv:
@@ -83,7 +83,7 @@ def test_rewards_worked_by_hand() -> None:
     """
     v1, v2 = 1 - 0.618, 1 - 0.618**2
     for slot in (0, 1):
-        env = SenderEnv(Interruption(law="fixed", t_max=4), 2, actions="slots")
+        env = SenderEnv(Interruption(law="fixed", t_max=4), 2, reward="retained", actions="slots")
         env.reset(seed=0)
         rewarded = []
         for action in (3, 3, slot, 2):
@@ -148,7 +148,7 @@ def test_every_step_of_random_play(scenario: str, options: dict[str, Any]) -> No
 
 @kernels
 def test_an_episode_that_asks_for_no_decision_ends_with_the_first_step() -> None:
-    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow", actions="slots")
+    env = SenderEnv(Interruption(law="fixed", t_max=3), 8, decide_at="overflow", reward="retained", actions="slots")
     observation, info = env.reset(seed=0)
     assert info["action_mask"].tolist() == [False] * 8 + [True, False]
     assert not any(array.any() for array in observation.values())
@@ -191,7 +191,7 @@ def test_a_library_that_tries_an_argument_sees_pythons_own_error() -> None:
         with pytest.raises(
             TypeError, match=r"^Uplink\.__init__\(\) got an unexpected keyword argument 'frameskip': unknown"
         ):
-            make_one("bufgym/Uplink-v0", frameskip=1)
+            make_one("bufgym/Uplink-v1", frameskip=1)
     with pytest.raises(ValueError, match="'capacty'; did you mean 'capacity'"):
         SenderEnv(capacty=3, actions="slots")
 
@@ -246,7 +246,7 @@ def test_what_someone_holds_stays_as_it_is() -> None:
     assert (array_held == 2).all() and (part_held == 3).all() and list(shared) == [4] * len(shared)
 
 
-@pytest.mark.parametrize("id", ["bufgym/Uplink-v0", "bufgym/Topics-v0"])
+@pytest.mark.parametrize("id", ["bufgym/Uplink-v1", "bufgym/Topics-v0"])
 def test_the_context_alone_is_that_of_all_fields(id: str) -> None:
     fields = [field.name for field in CONTEXT_FIELDS + (TOPIC_CONTEXT_FIELDS if "Topics" in id else ())]
     whole, alone = (gym.make_vec(id, 3, capacity=5, actions="slots", fields=names) for names in (None, fields))
@@ -259,7 +259,7 @@ def test_the_context_alone_is_that_of_all_fields(id: str) -> None:
 
 
 def test_what_an_owner_does_to_a_batch_s_dicts_changes_no_other() -> None:
-    batch = gym.make_vec("bufgym/Uplink-v0", 2, capacity=3, actions="slots")
+    batch = gym.make_vec("bufgym/Uplink-v1", 2, capacity=3, actions="slots")
     batch.reset(seed=1)
     for _ in range(9):
         seen, *_, info = batch.step(np.zeros(2, np.int64))

@@ -248,7 +248,7 @@ def test_arrays_handed_out_are_never_written_again(mode: str, form: str) -> None
 
 
 def test_gymnasiums_wrappers_understand_the_infos() -> None:
-    envs: Any = DictInfoToList(RecordEpisodeStatistics(FlattenObservation(vector("interruption"))))
+    envs: Any = DictInfoToList(RecordEpisodeStatistics(FlattenObservation(vector("interruption", reward="retained"))))
     envs.reset(seed=0)
     finished = 0
     for _ in range(60):
@@ -269,9 +269,9 @@ def begun() -> SenderVectorEnv:
 
 @pytest.mark.parametrize("mode", [SAME_STEP, "SameStep", "SAME_STEP"])
 def test_autoreset_in_each_way_that_gymnasium_has(mode: Any) -> None:
-    native = gym.make_vec("bufgym/Uplink-v0", 2, autoreset_mode=mode, actions="slots")
+    native = gym.make_vec("bufgym/Uplink-v1", 2, autoreset_mode=mode, actions="slots")
     kwargs = {"autoreset_mode": native.metadata["autoreset_mode"]}
-    sync = gym.make_vec("bufgym/Uplink-v0", 2, "sync", vector_kwargs=kwargs, actions="slots")
+    sync = gym.make_vec("bufgym/Uplink-v1", 2, "sync", vector_kwargs=kwargs, actions="slots")
     assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is SAME_STEP
 
 
@@ -282,7 +282,7 @@ test_wrong_use_is_named = refused(
     (lambda: SenderVectorEnv(0, actions="slots"), "num_envs = 0"),
     (lambda: SenderVectorEnv(autoreset_mode="Sometimes", actions="slots"), "autoreset_mode = 'Sometimes'"),
     (
-        lambda: gym.make_vec("bufgym/Uplink-v0", 1, "sync", autoreset_mode="SameStep", actions="slots"),
+        lambda: gym.make_vec("bufgym/Uplink-v1", 1, "sync", autoreset_mode="SameStep", actions="slots"),
         "SyncVectorEnv by vector_kwargs",
     ),
     *(

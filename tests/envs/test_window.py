@@ -47,9 +47,9 @@ def screen() -> NDArray[np.uint8] | None:
 
 def test_each_reset_and_step_shows_the_image(waits: list[float]) -> None:
     """A reset, five steps and a call of ``render`` are seven pictures, at ten a second."""
-    seen = gym.make("bufgym/Interruption-v0", render_mode="human", law="fixed", t_max=6, capacity=2, actions="slots")
+    seen = gym.make("bufgym/Interruption-v1", render_mode="human", law="fixed", t_max=6, capacity=2, actions="slots")
     drawn = gym.make(
-        "bufgym/Interruption-v0", render_mode="rgb_array", law="fixed", t_max=6, capacity=2, actions="slots"
+        "bufgym/Interruption-v1", render_mode="rgb_array", law="fixed", t_max=6, capacity=2, actions="slots"
     )
     assert screen() is None and "human" in seen.metadata["render_modes"]
     seen.reset(seed=0), drawn.reset(seed=0)
@@ -69,7 +69,7 @@ def test_each_reset_and_step_shows_the_image(waits: list[float]) -> None:
 def test_a_batch_shows_its_rows_side_by_side(waits: list[float]) -> None:
     """Three rows of 800 x 400: two above, the third below on the left, white beside it."""
     seen = gym.make_vec(
-        "bufgym/Interruption-v0", num_envs=3, render_mode="human", law="fixed", t_max=6, capacity=2, actions="slots"
+        "bufgym/Interruption-v1", num_envs=3, render_mode="human", law="fixed", t_max=6, capacity=2, actions="slots"
     )
     drawn = SenderVectorEnv(3, **ON, render_mode="rgb_array", actions="slots")
     for envs in (seen, drawn):

@@ -18,15 +18,15 @@ sys.path.insert(0, str(REPO))
 
 WORDS = """0 1 2 -1 1e9 1e-9 nan inf 1,2 1,1 none x afr afr,drop-oldest decimate:every=2 decimate:every=0 afr:x=1
 lte-v1 topics-v1 fleet-v1 lte-synthetic-0 drive-0 exponential:0.5 exponential:2 saturating:3 nowhere nowhere.csv
-/dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v0 -- -o"""
+/dev/null /dev/zero . out.csv out.png out csv mahimahi validation test uniform client.toml link.csv Uplink-v1 -- -o"""
 VALUES = [*WORDS.split(), "", "9" * 30, "1" * 5000, "\x1b[31m", "\n", "\u2013", "\udcff"]
 
 WORK = """bufgym.benchmark.run.run bufgym.benchmark.sweep.run_sweep bufgym.benchmark.leaderboard.make
-bufgym.benchmark.leaderboard.validate bufgym_live.robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
-bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_live.robot.commands.send
-bufgym_live.robot.commands.receive bufgym_live.robot.commands.link bufgym_live.robot.ros2.commands.send
-bufgym_live.robot.ros2.commands.receive bufgym_live.relay.commands.serve bufgym_live.relay.commands.robot
-bufgym_live.relay.commands.foxglove bufgym_live.robot.cost.cost bufgym_live.robot.validate.validate
+bufgym.benchmark.leaderboard.validate bufgym_robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
+bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_robot.commands.send
+bufgym_robot.commands.receive bufgym_robot.commands.link bufgym_robot.ros2.commands.send
+bufgym_robot.ros2.commands.receive bufgym_relay.commands.serve bufgym_relay.commands.robot
+bufgym_relay.commands.foxglove bufgym_robot.cost.cost bufgym_robot.validate.validate
 bufgym.envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
 

@@ -124,7 +124,7 @@ def test_other_odd_recordings() -> None:
 @STORAGES
 def test_twelve_files_are_read_and_played_in_the_order_of_the_metadata(tmp_path: Path, storage: str) -> None:
     """By name _10 and _11 come before _2. The robot's own order is that of every other reader."""
-    BagSource = pytest.importorskip("bufgym_live.relay.bag", reason=needs("extras", "bufgym_live.relay.bag")).BagSource
+    BagSource = pytest.importorskip("bufgym_robot.fleet.bag", reason=needs("extras", "msgspec")).BagSource
 
     names = [f"d_{k}.{ENDING[storage]}" for k in range(12)]
     for k, name in enumerate(names):

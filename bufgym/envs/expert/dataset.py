@@ -119,7 +119,7 @@ def record(
 
 
 def make(
-    env: str = "bufgym/Uplink-v0",
+    env: str = "bufgym/Uplink-v1",
     kind: str = "expert",
     episodes: int = 100,
     *,

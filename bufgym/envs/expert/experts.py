@@ -64,7 +64,7 @@ def online(env: Any) -> PolicyExpert:
     sub_envs = sub_envs_of(env)
     if not isinstance(sub_envs.scenario, Interruption):
         raise BufgymError(
-            f"expert.online: known for bufgym/Interruption-v0, not for {type(sub_envs.scenario).__name__}"
+            f"expert.online: known for bufgym/Interruption-v1, not for {type(sub_envs.scenario).__name__}"
         )
     return PolicyExpert(
         env, online_optimum(sub_envs.capacity, law(sub_envs.scenario), sub_envs.scenario.value).policy()

@@ -1,4 +1,4 @@
-"""The scenarios of a suite as one: ``bufgym/Suite-v0``."""
+"""The scenarios of a suite as one: ``bufgym/Suite-v1``."""
 
 import functools
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class SuiteScenario:
         suite = suites.get(self.suite)
         if suite.kind != "queue":
             raise BufgymError(
-                f"suite {suite.name} is one of {suite.kind}: bufgym/Suite-v0 has those of one queue alone"
+                f"suite {suite.name} is one of {suite.kind}: bufgym/Suite-v1 has those of one queue alone"
             )
         if self.split not in suites.SPLITS:
             raise BufgymError(f"split = {self.split!r}: must be one of {', '.join(suites.SPLITS)}")

@@ -56,7 +56,7 @@ def test_what_is_paid_comes_at_the_end() -> None:
 
 def test_its_terms_are_for_its_recording_alone() -> None:
     made()  # registers the terms
-    env: Any = gym.make("bufgym/Uplink-v0", duration_s=1.0, reward="covered", actions="slots")
+    env: Any = gym.make("bufgym/Uplink-v1", duration_s=1.0, reward="covered", actions="slots")
     env.reset(seed=0)
     with pytest.raises(BufgymError, match=r"of 30 messages: .* is for bufgym/Mapping-v0, of 240"):
         for _ in range(40):

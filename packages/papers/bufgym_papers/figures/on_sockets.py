@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from bufgym.model.qoi import Value
 from bufgym.policies import Policy
 from bufgym.sim import Senders
-from bufgym_live.robot.sender import Leaves
-from bufgym_live.robot.validate import play
 from bufgym_papers.figures.rows import FigureRows
+from bufgym_robot.sender import Leaves
+from bufgym_robot.validate import play
 
 UNITS = ("_s", "_ms", "_hz")  # Suffixes of the columns that are compared
 
