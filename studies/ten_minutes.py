@@ -124,7 +124,7 @@ def train(training: Training, minutes: Sequence[float], lines: Path, environment
         python = python_of(LIBRARIES[training.library], environments)
         options = [f"--{name}={value}" for name, value in training._asdict().items()]
         options += [f"--lines={lines.absolute()}", f"--episodes={episodes}", "--minutes", *map(str, minutes)]
-        paths = os.pathsep.join(str(REPO / part) for part in ("", "packages/robot", "packages/relay", "packages/papers"))
+        paths = os.pathsep.join([str(REPO), *map(str, sorted((REPO / "packages").iterdir()))])
         where = os.environ | {"PYTHONPATH": paths}
         begun = [python, "-m", "studies.budget", *options]
         done = subprocess.run(begun, cwd=REPO, env=where, stderr=subprocess.PIPE, text=True, check=False)
