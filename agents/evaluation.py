@@ -47,7 +47,7 @@ def play(agent: Policy, cells: Sequence[Cell], sizes: Sequence[int], episodes: S
     ends = np.cumsum(sizes).tolist()
     outcomes = []
     for cell, size, end in zip(cells, sizes, ends, strict=True):
-        senders = run(agent, episodes[end - size : end], cell.capacity, cell.scenario.value)
+        senders = run(agent, episodes[end - size : end], cell.capacity, cell.scenario.value, max_bytes=cell.max_bytes)
         outcomes += [outcome(senders, i) for i in range(size)]
     return outcomes
 

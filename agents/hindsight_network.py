@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from bufgym.policies.ruled_network import RuledWeights, fields_seen, seen
 
@@ -52,3 +53,18 @@ def expected(outputs: Tensor, cost: Tensor) -> tuple[Tensor, Tensor]:
     log_p = torch.log_softmax(outputs.masked_fill(~offered, NEVER), dim=1)
     p = log_p.exp()
     return (p * cost.masked_fill(~offered, 0)).sum(dim=1), -(p * log_p).sum(dim=1)
+
+
+def ranked(outputs: Tensor, cost: Tensor) -> Tensor:
+    """Each state's sum over pairs of offered actions, a dearer than b, of
+
+        (cost(a) - cost(b)) log(1 + exp(output(a) - output(b))).
+
+    For a pair it is least where output(b) - output(a) is the logarithm of what b saves over what b loses: above 0 if b
+    costs less on average. Its gradient does not vanish while an order is wrong, as that of ``expected`` does.
+    """
+    offered = torch.isfinite(cost)
+    pairs = offered[:, :, None] & offered[:, None, :]
+    known = cost.masked_fill(~offered, 0)
+    more = (known[:, :, None] - known[:, None, :]).clamp(min=0) * pairs
+    return (more * functional.softplus(outputs[:, :, None] - outputs[:, None, :])).sum(dim=(1, 2))

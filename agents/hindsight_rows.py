@@ -64,7 +64,12 @@ class TaughtRows:
         self.groups, self._players, self._teachers = [], [], list[Hindsight]()
         for part in parts:
             options = Options(
-                capacity=part.cell.capacity, decide_at="arrival", actions="slots", fields=("occupancy",), info="mask"
+                capacity=part.cell.capacity,
+                max_bytes=part.cell.max_bytes,
+                decide_at="arrival",
+                actions="slots",
+                fields=("occupancy",),
+                info="mask",
             )
             sub_envs = SubEnvs(part.rows, part.cell.scenario, options)
             self.groups.append(sub_envs)

@@ -11,25 +11,31 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from bufgym.benchmark.sweep import Sweep
 from bufgym.envs import SenderVectorEnv
-from bufgym.scenario import Scenario, suites
+from bufgym.scenario import Scenario
 
 
 class Cell(NamedTuple):
     """One scenario at one capacity.
 
-    ``label`` is the scenario's name in its suite; ``capacity`` is L in messages.
+    ``label`` is the scenario's name in its suite, ``capacity`` L in messages, ``max_bytes`` B in bytes, or None.
     """
 
     label: str
     scenario: Scenario
     capacity: int
+    max_bytes: int | None = None
 
 
 def cells(suite: str, split: str, capacities: Sequence[int], data: str | None = None) -> list[Cell]:
-    """All scenarios of the split at all these capacities."""
-    settings = suites.get(suite).settings(split, data)
-    return [Cell(label, setting.scenario, L) for label, setting in settings.items() for L in capacities]
+    """All scenarios of the split at all these capacities, or at their own where these are the suite's usual ones."""
+    chosen = Sweep(suite, (), split, tuple(capacities), 1, data)
+    return [
+        Cell(label, setting.scenario, L, setting.max_bytes)
+        for label, setting in chosen.settings().items()
+        for L in chosen.capacities_of(setting)
+    ]
 
 
 class MixedEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
@@ -48,7 +54,9 @@ class MixedEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
 
     def __init__(self, cells: Sequence[Cell], sizes: Sequence[int], **options: Any) -> None:
         self.groups = [
-            SenderVectorEnv(n, cell.scenario, cell.capacity, autoreset_mode="SameStep", **options)
+            SenderVectorEnv(
+                n, cell.scenario, cell.capacity, max_bytes=cell.max_bytes, autoreset_mode="SameStep", **options
+            )
             for cell, n in zip(cells, sizes, strict=True)
         ]
         self.num_envs = sum(sizes)

@@ -225,7 +225,7 @@ class Hindsight(Settings):
     width: Count = 64
     """Hidden units of both layers."""
     num_envs: Natural = 0
-    """Environments side by side, a sixth of which the rule plays; 0: 256 in an environment, else 384."""
+    """Environments side by side, a sixth of which the rule plays; 0: 128 in an environment, else 384."""
     batch_size: Natural = 0
     """Decisions of one gradient step; 0: 1024 in an environment, else 2560."""
     gradient_steps: Annotated[int, NO_OPTION] = 2
@@ -233,7 +233,8 @@ class Hindsight(Settings):
     learning_rate: Positive = 2e-3
     """At the start; falls linearly to a twentieth."""
     entropy: Annotated[float, NO_OPTION] = 0.3
-    """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time."""
+    """Bonus for entropy at the start, in units of what action 0 costs; falls to 0 by half time. In an environment there
+    is none."""
     room: Annotated[int, NO_OPTION] = 400_000
     """Decisions kept to learn from; they take about 60 MB."""
     checkpoint_every: Annotated[int, NO_OPTION] = 100_000
@@ -252,7 +253,7 @@ class Hindsight(Settings):
     @property
     def resolved(self) -> "Hindsight":
         """The same without zeros that stand for numbers by the task."""
-        usual: dict[str, Any] = {"candidates": 2, "num_envs": 256, "batch_size": 1024}
+        usual: dict[str, Any] = {"candidates": 2, "num_envs": 128, "batch_size": 1024}
         if self.kind != "environment":
             usual = {"candidates": 3, "num_envs": 384, "batch_size": 2560}
         return replace(self, **{name: getattr(self, name) or number for name, number in usual.items()})

@@ -55,6 +55,16 @@ def test_a_row_of_a_mix_is_the_environment_of_its_cell() -> None:
             assert [final is not None for final in info["final_obs"]] == ended.tolist()
 
 
+def test_a_suite_is_met_within_its_settings_limits() -> None:
+    """Under B = 1.84 MB, twenty messages of mean size, jpeg-v1 has one L, 31; its others are met with L = 8 and 15."""
+    met = mixed_env.cells("jpeg-v1", "train", (8, 15))
+    limited = [cell for cell in met if cell.label.endswith("-bytes")]
+    assert {(cell.capacity, cell.max_bytes) for cell in limited} == {(31, 1_840_000)}
+    assert {cell.capacity for cell in met if cell.max_bytes is None} == {8, 15}
+    (rows,) = mixed_env.MixedEnv(limited[:1], [2], info="mask").groups
+    assert rows.sub_envs.senders.max_bytes == 1_840_000 and rows.sub_envs.capacity == 31
+
+
 def test_rewards_add_up_to_the_information_and_rows_begin_anew() -> None:
     env = GymVecEnv(mixed_rows())
     env.seed(0)

@@ -12,7 +12,7 @@ import torch
 from agents import ready_families
 from agents.held_out import split_scenario
 from agents.hindsight import HindsightLearner, School
-from agents.hindsight_network import Student, expected
+from agents.hindsight_network import Student, expected, ranked
 from agents.hindsight_rows import Lesson, Lessons, Part, TaughtRows
 from agents.mixed_env import Cell
 from agents.objectives import families
@@ -59,6 +59,32 @@ def test_expected_cost_and_entropy_by_hand() -> None:
     costs, entropy = expected(outputs, torch.tensor([[1.0, 0.2, math.inf]]))
     assert costs.tolist() == pytest.approx([0.25 * 1.0 + 0.75 * 0.2])
     assert entropy.tolist() == pytest.approx([-0.25 * math.log(0.25) - 0.75 * math.log(0.75)])
+
+
+def test_pairs_by_hand() -> None:
+    """Output 3 times as likely, costs 1 and 0.2: 0.8 log(1 + 1/3); the third is not offered, so is in no pair."""
+    outputs = torch.tensor([[0.0, math.log(3.0), 50.0]])
+    assert ranked(outputs, torch.tensor([[1.0, 0.2, math.inf]])).tolist() == pytest.approx([0.8 * math.log(4 / 3)])
+    three = ranked(torch.zeros(1, 3), torch.tensor([[0.0, 1.0, 5.0]]))
+    assert three.tolist() == pytest.approx([(1 + 5 + 4) * math.log(2)])
+    assert ranked(outputs, torch.zeros(1, 3)).tolist() == [0]  # names of one decision
+
+
+def test_pairs_are_least_where_outputs_tell_what_is_saved_from_what_is_lost() -> None:
+    """The second action saves 2 in three of four futures and loses 1 in the fourth: log(6) apart."""
+    cost = torch.tensor([[2.0, 0.0]] * 3 + [[0.0, 1.0]])
+    apart = torch.linspace(-3, 5, 8_001, dtype=torch.float64)
+    losses = [float(ranked(torch.tensor([[0.0, x]] * 4), cost).sum()) for x in apart.tolist()]
+    assert float(apart[int(np.argmin(losses))]) == pytest.approx(math.log(6), abs=0.01)
+
+
+def test_an_action_that_was_given_up_is_taken_up_again() -> None:
+    """By pairs the gradient at a wrong order is the difference of costs; that of the softmax is gone."""
+    cost = torch.tensor([[1.0, 0.0]])
+    for loss, gradient in ((lambda out: expected(out, cost)[0], 0.0), (lambda out: ranked(out, cost), -1.0)):
+        outputs = torch.tensor([[60.0, 0.0]], requires_grad=True)
+        loss(outputs).sum().backward()
+        assert outputs.grad is not None and outputs.grad[0].tolist() == pytest.approx([-gradient, gradient], abs=1e-9)
 
 
 @pytest.mark.parametrize("candidates", [2, 3])
@@ -175,13 +201,15 @@ def test_families_that_lose_more_are_drawn_more() -> None:
     assert school.sizes().tolist() == [250 + 375, 250 + 125]
 
 
-def test_gradient_steps_find_the_cheap_actions() -> None:
+@pytest.mark.parametrize("sets", [Families(), Families(("task",))])
+def test_gradient_steps_find_the_cheap_actions(sets: Families) -> None:
     """What is best depends on what is seen: after 200 steps almost all weight is there, and the mean follows."""
     rng, lessons = np.random.default_rng(0), Lessons(1, 1000, (seen(2), 5))
     family = np.zeros(300, np.int64)
     lessons.add(lesson(300, 1.0, 1.0, 0.0, 2.0, 2.0, 2.0), family, rng)
     lessons.add(lesson(300, -1.0, 1.0, 2.0, 2.0, 0.0, 2.0), family, rng)
-    school = School(Hindsight(width=16, batch_size=256, steps=1000, learning_rate=1e-2).resolved, 1, math.inf)
+    settings = Hindsight(width=16, batch_size=256, steps=1000, learning_rate=1e-2, candidates=2, sets=sets)
+    school = School(settings.resolved, 1, math.inf)
     shown, offered = np.array([[1.0], [-1.0]], np.float32).repeat(seen(2), axis=1), np.ones((2, 5), np.bool_)
     assert school.choose(shown, offered).tolist() == [4, 0]  # the first shows a steady link
     sizes, losses = school.sizes(), []

@@ -17,6 +17,7 @@ from agents.callbacks import checkpoints
 from agents.held_out import FixedEpisodes
 from agents.learner import Learner, learner_of
 from agents.settings import Settings
+from agents.tasks import Environment
 from bufgym import policies
 from bufgym.envs import SenderVectorEnv
 from bufgym.policies.ruled_network import RuledWeights, seen
@@ -71,8 +72,8 @@ def test_a_new_learner_is_a_class_and_its_settings(monkeypatch: Patch) -> None:
     monkeypatch.setattr(train, "main", asked.append)
     train.add_command(Still)
     with pytest.raises(SystemExit):
-        train.typed(["still", "--capacity=3", "--duration-s=1", "--validation-episodes=2", "--name=tiny"])
-    assert asked == [Still(environment=dataclasses.replace(ON, episodes=200), name="tiny", validation_episodes=2)]
+        train.typed(["still", "--capacity=3", "--validation-episodes=2", "--name=tiny"])
+    assert asked == [Still(environment=Environment(capacity=3), name="tiny", validation_episodes=2)]
     (run,) = learner_of(asked[0]).train(runs.prepare(asked[0]))
     judges = FixedEpisodes(asked[0].environment, "validation", 2)
     assert run.merit == np.mean([outcome.qoi for outcome in judges.play(policies.get("gap-price"))])

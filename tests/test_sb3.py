@@ -54,8 +54,8 @@ def same(a: Any, b: Any) -> bool:
 def test_rows_are_those_of_the_native_batch_and_their_ends_are_told(id: str) -> None:
     """tests/envs shows that the native batch's rows are single environments."""
     n, rng = 3, np.random.default_rng(0)
-    envs = make_vec_env(id, n, seed=7, **SMALL[id])
-    native: Any = gym.make_vec(id, n, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP, **SMALL[id])
+    envs = make_vec_env(id, n, seed=7, reward="retained", **SMALL[id])
+    native: Any = gym.make_vec(id, n, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP, reward="retained", **SMALL[id])
     observation, (last, info) = envs.reset(), native.reset(seed=7)
     sums, lengths, ends = np.zeros(n), np.zeros(n, int), 0
     for _ in range(60):
@@ -137,7 +137,7 @@ def test_seeds_and_options_hold_for_one_reset() -> None:
 
 def test_a_monitor_file(tmp_path: Path) -> None:
     """T = 20 always: each episode has 20 decisions, and what it delivers is written to the folder as Monitor does."""
-    given: dict[str, Any] = {"t_max": 20, "law": "fixed", "capacity": L, "seed": 5}
+    given: dict[str, Any] = {"t_max": 20, "law": "fixed", "capacity": L, "seed": 5, "reward": "retained"}
     envs = make_vec_env("bufgym/Interruption-v1", 3, monitor_dir=str(tmp_path), **given, actions="slots")
     assert envs.num_envs == 3
     envs.reset()

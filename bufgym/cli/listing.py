@@ -19,11 +19,12 @@ def listing(what: Kind | None = None, /) -> None:
 
 
 def environments() -> dict[str, str]:
-    """Map the id of every environment that bufgym registers with Gymnasium to its scenario."""
+    """Map the id of every environment that bufgym registers with Gymnasium, in its newest version, to its scenario."""
     import gymnasium
 
-    specs = [spec for spec in gymnasium.registry.values() if spec.namespace == "bufgym"]
-    return {spec.id: str(spec.kwargs["scenario"]) for spec in specs if "scenario" in spec.kwargs}
+    specs = [spec for spec in gymnasium.registry.values() if spec.namespace == "bufgym" and "scenario" in spec.kwargs]
+    newest = {spec.name: spec for spec in sorted(specs, key=lambda spec: spec.version or 0)}
+    return {spec.id: str(spec.kwargs["scenario"]) for spec in newest.values()}
 
 
 def _list_environments() -> str:

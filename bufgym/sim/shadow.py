@@ -58,6 +58,7 @@ class Shadows:
             "log": records(senders.batch.log.shape, LOG_ENTRY),
             "order": np.zeros(senders.batch.order.shape, np.int64),
             "topics": records(senders.batch.topics.shape, TOPIC),
+            "past": np.zeros(senders.batch.past.shape),
             "parameters": policy.parameter_array,
         }
         self._seen = senders.batch
@@ -81,6 +82,7 @@ class Shadows:
         for own, theirs in ((shadows.senders, of.senders), (shadows.topics, of.topics)):
             # whole words are copied faster than records
             own.view(np.int64).reshape(len(own), -1)[rows] = theirs.view(np.int64).reshape(len(own), -1)[rows]
+        shadows.past[rows] = 0.0
         shadows.senders["ask_when_full"][rows] = 0
         self._senders.follow(self.policy, shadows.senders)
         self.memory[rows] = self._fresh

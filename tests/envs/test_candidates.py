@@ -306,7 +306,8 @@ def test_an_episode_without_a_decision_gives_up_nothing() -> None:
 @kernels
 @pytest.mark.parametrize("actions", ["candidates", "slots"])
 @pytest.mark.parametrize(
-    ("name", "more"), [("Uplink-v1", {}), ("Interruption-v1", {}), ("Suite-v1", {"suite": "generated-v1"})]
+    ("name", "more"),
+    [("Uplink-v1", {"duration_s": 10.0}), ("Interruption-v1", {}), ("Suite-v1", {"suite": "generated-v1"})],
 )
 def test_rewards_and_the_bound_have_one_clairvoyant(name: str, more: dict[str, Any], actions: str) -> None:
     """Default environments: ``regret`` sums to H less the H that ``bound`` names, the first step's loss included."""

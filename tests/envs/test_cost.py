@@ -54,6 +54,7 @@ KINDS: dict[str, tuple[Any, dict[str, Any]]] = {
     "slots": (SIZES, {"actions": "slots", "reference": "codel"}),
     "dead link": (DEAD, {"reference": "random"}),
     "held": (EQUAL, {"repeat": 3, "reference": "target-gap"}),
+    "a rule that remembers": (EQUAL, {"reference": "learned"}),
     "own V": (SuiteScenario("interruption-v1"), {"reference": "drop-newest"}),
 }
 L = 4

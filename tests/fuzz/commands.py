@@ -25,7 +25,7 @@ WORK = """bufgym.benchmark.run.run bufgym.benchmark.sweep.run_sweep bufgym.bench
 bufgym.benchmark.leaderboard.validate bufgym_robot.cost.measure bufgym.traces.datasets.fetch.fetch_dataset
 bufgym_papers.figures.commands._text bufgym.cli.play.play bufgym_robot.commands.send
 bufgym_robot.commands.receive bufgym_robot.commands.link bufgym_robot.ros2.commands.send
-bufgym_robot.ros2.commands.receive bufgym_relay.commands.serve bufgym_relay.commands.robot
+bufgym_robot.ros2.commands.receive bufgym_relay.commands.serve bufgym_robot.fleet.commands.robot
 bufgym_relay.commands.foxglove bufgym_robot.cost.cost bufgym_robot.validate.validate
 bufgym.envs.expert.dataset.make"""
 """What takes long, downloads, or needs a terminal."""
