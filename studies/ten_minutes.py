@@ -1,304 +1,226 @@
-"""The score after ten minutes of one core, for each library of examples/trainers that trains a policy.
+"""The score after ten minutes of one core, for each library: the table of results/trainers.md.
 
-python -m studies.ten_minutes --library tianshou --minutes 10 --out runs/ten_minutes.csv
+python -m studies.ten_minutes --lines studies/ten_minutes.csv
+python -m studies.ten_minutes --lines studies/ten_minutes.csv --page results/trainers.md
 
-Each library has its own PPO, with its defaults or the numbers of its first example, on ``Uplink-v1`` with L = 8. Only
-Tianshou has its DQN. Actions are the environment's default, ordered candidates, and all of them are valid. So no
-library needs a mask. The reward is ``regret`` unless ``--reward`` names another. The minutes are processor time of the
-process and all those below it, so other work on the machine does not matter. Imports and the score itself do not count.
-Training is cut wherever it is by then. The score is computed as in ``studies.sb3_defaults``, which needs the extras
-``train`` and ``plot`` beside the library.
+The first command trains all libraries of ``studies.libraries``, one process after another: first each with one seed and
+``regret``, then with ``paired``, then the next seed. Each evaluation is a line of the file at once. The same command
+goes on where it was cut: what is complete in the file stays, and a training that was cut or failed is made anew. A
+library that this Python does not have gets an environment of its own below ``--environments``, with what its row of
+docs/guide/trainers.md installs; where that fails, the line says why. The second command puts the table of the file into
+the page.
 """
 
 from __future__ import annotations
 
+import csv
+import importlib.util
+import io
+import math
 import os
-import signal
+import re
+import shlex
+import subprocess
 import sys
-from collections.abc import Callable
-from importlib import import_module
-from itertools import pairwise
+import venv
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-os.environ["OMP_NUM_THREADS"] = "1"  # before any library is imported
-
-import gymnasium as gym
 import numpy as np
-import psutil
-import torch
+from filelock import FileLock, Timeout
 
-import bufgym  # noqa: F401  (registers the environments)
-from bufgym.utils.errors import unknown
-from studies.page import command
-from studies.sb3_defaults import Episodes, append
+from bufgym.benchmark.bootstrap import RESAMPLES, SEED, interval, stream, times_drawn
+from bufgym.utils.errors import BufgymError, unknown
+from bufgym.utils.files import write_text
+from studies.budget import LINE, MINUTES
+from studies.libraries import HELD, LIBRARIES, Library
+from studies.page import command, table, written
+from studies.sb3_defaults import RULES, Episodes, append
 
-ENV, CAPACITY = "bufgym/Uplink-v1", 8
-LINE = ("library", "reward", "minutes", "score")
-
-
-class TimeIsUp(BaseException):
-    """The processor time is used up; no ``Exception``, so that no library catches it."""
-
-
-class Budget:
-    """A block that ends after so much processor time of this process and of those below it."""
-
-    def __init__(self, minutes: float) -> None:
-        self.minutes = minutes
-        self._began_s = 0.0
-
-    def __enter__(self) -> None:
-        self._began_s = _processor_s()
-        signal.signal(signal.SIGPROF, self._check)
-        signal.setitimer(signal.ITIMER_PROF, 0.5, 0.5)  # again and again: a destructor swallows what is raised in it
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> bool:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        print(f"{_processor_s() - self._began_s:.0f} s of processor time", file=sys.stderr)
-        return kind is TimeIsUp
-
-    def _check(self, number: int, frame: FrameType | None) -> None:
-        if _processor_s() - self._began_s >= 60 * self.minutes:
-            raise TimeIsUp
+REPO = Path(__file__).resolve().parent.parent
+TRAINERS = REPO / "docs" / "guide" / "trainers.md"
+BEGIN, END = "<!-- begin: studies.ten_minutes -->", "<!-- end: studies.ten_minutes -->"
 
 
-def _processor_s() -> float:
-    """Seconds of this process and all below it, ended ones too."""
-    root = psutil.Process()
-    return sum(sum(process.cpu_times()[:4]) for process in (root, *root.children(recursive=True)))
+class Training(NamedTuple):
+    """One training; its fields are columns of the file of lines."""
 
-
-class Trained(NamedTuple):
-    """What a library made: the most likely actions to a batch of observations."""
-
-    act: Callable[[Any], Any]
-
-    def predict(self, observation: Any, deterministic: bool) -> tuple[Any, None]:
-        """Actions int64[n], under the name that ``Episodes.of_model`` calls."""
-        with torch.no_grad():
-            return np.asarray(self.act(observation)), None
-
-
-class Task(NamedTuple):
-    """What each library learns: the environment, with this reward."""
-
+    library: str
     reward: str
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Settings of the environment for training."""
-        return {"capacity": CAPACITY, "info": "mask", "reward": self.reward}
-
-    def make(self) -> gym.Env[Any, Any]:
-        """One environment."""
-        return gym.make(ENV, **self.settings)
-
-    def make_batch(self, n: int) -> gym.vector.VectorEnv[Any, Any, Any]:
-        """n rows of the native batch."""
-        return gym.make_vec(ENV, n, **self.settings)
+    seed: int
 
 
-def tensor(numbers: Any) -> torch.Tensor:
-    """Numbers as float32."""
-    return torch.as_tensor(numbers, dtype=torch.float32)
+Line = dict[str, str]
 
 
-def layers(*widths: int) -> torch.nn.Sequential:
-    """Linear layers with tanh between them."""
-    linear = [torch.nn.Linear(a, b) for a, b in pairwise(widths)]
-    return torch.nn.Sequential(linear[0], *(part for layer in linear[1:] for part in (torch.nn.Tanh(), layer)))
+def read(lines: Path) -> dict[Training, list[Line]]:
+    """The lines of each training, in the order of the file."""
+    found: dict[Training, list[Line]] = {}
+    if lines.exists():
+        with lines.open(newline="", encoding="utf-8") as file:
+            for line in csv.DictReader(file):
+                found.setdefault(Training(line["library"], line["reward"], int(line["seed"])), []).append(line)
+    return found
 
 
-def cleanrl(budget: Budget, task: Task) -> Trained:
-    """examples/ppo.py with as many decisions as fit, because its learning rate falls to 0 over them."""
-    ppo: Any = import_module("examples.ppo")
-    networks: list[Any] = []
-
-    class Network(ppo.Network):  # type: ignore[misc]
-        def __init__(self, *sizes: int) -> None:
-            super().__init__(*sizes)
-            networks.append(self)
-
-    ppo.Network = Network
-    with budget:
-        ppo.main(ppo.Settings(steps=int(budget.minutes * 600_000), reward=task.reward))
-    return Trained(lambda seen: networks[0].actor(tensor(seen)).argmax(dim=-1))
+def forget(lines: Path, training: Training) -> None:
+    """Take the lines of this training out of the file."""
+    kept = (line.values() for one, of_it in read(lines).items() for line in of_it if one != training)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([LINE, *kept])
+    write_text(lines, text.getvalue())
 
 
-def sbx(budget: Budget, task: Task) -> Trained:
-    """The defaults of its PPO."""
-    from sbx import PPO
-
-    from bufgym.sb3 import make_vec_env
-
-    model = PPO("MlpPolicy", make_vec_env(ENV, **task.settings))
-    with budget:
-        model.learn(10**9)
-    return Trained(lambda seen: model.predict(seen, deterministic=True)[0])
+def is_complete(of_it: Iterable[Line], minutes: float) -> bool:
+    """Whether a training has its last evaluation."""
+    return any(line["score"] and float(line["minutes"]) == minutes for line in of_it)
 
 
-def torchrl(budget: Budget, task: Task) -> Trained:
-    """The loop and the numbers of its tutorial on PPO, without its schedule."""
-    from tensordict.nn import TensorDictModule
-    from torchrl.collectors import Collector
-    from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
-    from torchrl.envs import GymWrapper
-    from torchrl.modules import ProbabilisticActor, ValueOperator
-    from torchrl.objectives import ClipPPOLoss
-    from torchrl.objectives.value import GAE
-
-    env = GymWrapper(task.make(), categorical_action_encoding=True)
-    inputs, actions = env.observation_spec["observation"].shape[-1], env.action_spec.n
-    scorer = TensorDictModule(layers(inputs, 256, 256, 256, actions), in_keys=["observation"], out_keys=["logits"])
-    actor = ProbabilisticActor(
-        scorer,
-        in_keys=["logits"],
-        distribution_class=torch.distributions.Categorical,
-        spec=env.action_spec,
-        return_log_prob=True,
-    )
-    critic = ValueOperator(layers(inputs, 256, 256, 256, 1), in_keys=["observation"])
-    loss_of = ClipPPOLoss(actor, critic, clip_epsilon=0.2, entropy_coeff=1e-4)
-    advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic, average_gae=True)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(1_000), sampler=SamplerWithoutReplacement(), batch_size=64)
-    optimizer = torch.optim.Adam(loss_of.parameters(), 3e-4)
-    with budget:
-        for played in Collector(env, actor, frames_per_batch=1_000, total_frames=-1):
-            for _ in range(10):
-                advantage(played)
-                buffer.extend(played.reshape(-1))
-                for _ in range(1_000 // 64):
-                    losses = loss_of(buffer.sample())
-                    sum(losses[f"loss_{name}"] for name in ("objective", "critic", "entropy")).backward()
-                    torch.nn.utils.clip_grad_norm_(loss_of.parameters(), 1.0)
-                    optimizer.step()
-                    optimizer.zero_grad()
-    net = scorer.module
-    return Trained(lambda seen: net(tensor(seen)).argmax(dim=-1))
+def words(package: str) -> list[str]:
+    """What the package's row of docs/guide/trainers.md installs besides bufgym."""
+    [row] = re.findall(rf"^\| \[[^|]*\| `{package}` \| `([^`]*)` \|", TRAINERS.read_text("utf-8"), re.MULTILINE)
+    return [word for word in shlex.split(row) if not word.startswith(".")]
 
 
-def tianshou(budget: Budget, task: Task) -> Trained:
-    """The numbers of the DQN in its README."""
-    from tianshou.algorithm import DQN
-    from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
-    from tianshou.algorithm.optim import AdamOptimizerFactory
-    from tianshou.data import Collector, VectorReplayBuffer
-    from tianshou.env import DummyVectorEnv
-    from tianshou.trainer import OffPolicyTrainerParams
-    from tianshou.utils.net.common import Net
-
-    env: Any = task.make()
-    space, actions = env.observation_space, env.action_space
-    net = Net(state_shape=space.shape, action_shape=actions.n, hidden_sizes=[128, 128, 128])
-    policy = DiscreteQLearningPolicy(model=net, action_space=actions, observation_space=space, eps_training=0.1)
-    optimizer = AdamOptimizerFactory(lr=1e-3)
-    algorithm = DQN(policy=policy, optim=optimizer, gamma=0.9, n_step_return_horizon=3, target_update_freq=320)
-    envs = DummyVectorEnv([task.make] * 10)
-    collector = Collector(algorithm, envs, VectorReplayBuffer(20_000, 10), exploration_noise=True)
-    with budget:
-        algorithm.run_training(
-            OffPolicyTrainerParams(
-                training_collector=collector,
-                max_epochs=10**6,
-                epoch_num_steps=10_000,
-                collection_step_num_env_steps=10,
-                update_step_num_gradient_steps_per_sample=0.1,
-                test_in_training=False,
-            )
-        )
-    return Trained(lambda seen: net(seen)[0].argmax(dim=-1))
+def python_of(library: Library, environments: Path) -> str:
+    """A Python that has the library: this one, or one in an environment of its own, made if it is not there."""
+    if importlib.util.find_spec(library.package):
+        return sys.executable
+    folder = environments / f"venv-{library.package}"
+    python, ready = str(folder / "bin" / "python"), folder / "ready"
+    if not ready.exists():
+        print(f"{library.package}: making {folder}", flush=True)
+        venv.create(folder, clear=True, with_pip=True)
+        install = [
+            python,
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "--no-compile",
+            ".[train,plot]",
+            "psutil",
+            *words(library.package),
+        ]
+        # Kernels come from the checkout and its cache.
+        where = os.environ | {"BUFGYM_NO_KERNELS": "1"}
+        done = subprocess.run(install, cwd=REPO, env=where, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise BufgymError(f"does not install: {last_line(done.stderr, 'ERROR')}")
+        ready.touch()
+    return python
 
 
-def rllib(budget: Budget, task: Task) -> Trained:
-    """The defaults of its PPO."""
-    from ray.rllib.algorithms.ppo import PPOConfig
-    from ray.tune.registry import register_env
-
-    register_env("uplink", lambda _: task.make())
-    algorithm = PPOConfig().environment("uplink").env_runners(num_env_runners=0).build_algo()
-    with budget:
-        while True:
-            algorithm.train()
-    net = algorithm.get_module()
-
-    def act(seen: Any) -> Any:
-        return net.forward_inference({"obs": tensor(seen)})["action_dist_inputs"].argmax(dim=-1)
-
-    return Trained(act)
+def last_line(text: str, word: str = "") -> str:
+    """The last line with the word, or the last at all."""
+    found = text.strip().splitlines() or ["no message"]
+    return ([line for line in found if word in line] or found)[-1].strip()
 
 
-def skrl(budget: Budget, task: Task) -> Trained:
-    """The defaults of its PPO on four environments, as in its examples."""
-    from skrl.envs.wrappers.torch import wrap_env
-    from skrl.utils.runner.torch import Runner
-
-    hidden = {"name": "net", "input": "OBSERVATIONS", "layers": [64, 64], "activations": "tanh"}
-    models = {
-        "separate": True,
-        "policy": {
-            "class": "CategoricalMixin",
-            "network": [hidden],
-            "output": "ACTIONS",
-            "unnormalized_log_prob": True,
-        },
-        "value": {"class": "DeterministicMixin", "network": [hidden], "output": "ONE"},
-    }
-    cfg = {"seed": 0, "models": models, "memory": {"class": "RandomMemory", "memory_size": -1}}
-    cfg["agent"] = {"class": "PPO", "rollouts": 16}  # its default, which the memory reads here
-    cfg["trainer"] = {"class": "SequentialTrainer", "timesteps": 10**9, "headless": True, "environment_info": "log"}
-    runner = Runner(wrap_env(task.make_batch(4)), cfg)
-    with budget:
-        runner.run("train")
-    policy = runner.agent.models["policy"]
-    return Trained(lambda seen: policy.compute({"observations": tensor(seen)}, role="policy")[0].argmax(-1))
+def train(training: Training, minutes: Sequence[float], lines: Path, environments: Path, episodes: int) -> None:
+    """Train once in a process of its own; where that fails, append a line that says why."""
+    try:
+        python = python_of(LIBRARIES[training.library], environments)
+        options = [f"--{name}={value}" for name, value in training._asdict().items()]
+        options += [f"--lines={lines.absolute()}", f"--episodes={episodes}", "--minutes", *map(str, minutes)]
+        paths = os.pathsep.join([str(REPO), *map(str, sorted((REPO / "packages").iterdir()))])
+        where = os.environ | {"PYTHONPATH": paths}
+        begun = [python, "-m", "studies.budget", *options]
+        done = subprocess.run(begun, cwd=REPO, env=where, stderr=subprocess.PIPE, text=True, check=False)
+        if done.returncode:
+            print(done.stderr[-3_000:], flush=True)
+            raise BufgymError(f"fails: {last_line(done.stderr)}")
+    except BufgymError as error:
+        print(f"{training.library}: {error}", flush=True)
+        append(lines, LINE, (training.library, "", training.reward, training.seed, "", "", "", error))
 
 
-def agilerl(budget: Budget, task: Task) -> Trained:
-    """The defaults of its PPO on one native batch of eight, as on our page."""
-    from agilerl.algorithms import PPO
-    from agilerl.rollouts.on_policy import collect_rollouts
+def rows(lines: Path, minutes: Sequence[float]) -> list[list[str]]:
+    """A row for each library and reward: the mean score over seeds after each of the minutes, best first.
 
-    envs = task.make_batch(8)
-    spaces = envs.single_observation_space, envs.single_action_space
-    agent = PPO(*spaces, num_envs=8, use_rollout_buffer=True, device="cpu")
-    agent.set_training_mode(True)
-    with budget:
-        while True:
-            collect_rollouts(agent, envs)
-            agent.learn()
-    net = agent.actor
-    return Trained(lambda seen: net.head_net.wrapped(net.extract_features(tensor(seen))).argmax(dim=-1))
+    The last has its interval over seeds where there are several. A library without a score has the reason.
+    """
+    seeds: dict[tuple[str, str], list[list[Line]]] = {}
+    for training, of_it in read(lines).items():
+        seeds.setdefault(training[:2], []).append(of_it)
+    made = []
+    for (name, reward), of_seeds in seeds.items():
+        after = {m: [float(line["score"]) for of_it in of_seeds for line in of_it if due(line, m)] for m in minutes}
+        why = [line["why"] for of_it in of_seeds for line in of_it if line["why"]]
+        last = after[minutes[-1]]
+        held = f", held for {HELD[reward]}" if reward in HELD else ""
+        label = [LIBRARIES[name].title, reward + held]
+        if not any(after.values()):
+            made.append((-math.inf, [*label, "0", *[""] * (len(minutes) - 1), why[-1]]))
+            continue
+        cells = [f"{np.mean(scores):.2f}" if scores else "" for scores in after.values()]
+        if len(last) > 1:
+            drawn = times_drawn(len(last), RESAMPLES, stream(SEED, name + reward)) @ np.array(last) / len(last)
+            cells[-1] = written(interval(drawn, len(last), within=(-math.inf, 1)), ".2f")
+        made.append((float(np.mean(last)) if last else -math.inf, [*label, str(max(map(len, after.values()))), *cells]))
+    return [row for _, row in sorted(made, key=lambda pair: -pair[0])]
 
 
-LIBRARIES: dict[str, Callable[[Budget, Task], Trained]] = {
-    "cleanrl": cleanrl,
-    "sbx": sbx,
-    "torchrl": torchrl,
-    "tianshou": tianshou,
-    "rllib": rllib,
-    "skrl": skrl,
-    "agilerl": agilerl,
-}
+def due(line: Line, minutes: float) -> bool:
+    """Whether the line has the score after so many minutes."""
+    return bool(line["score"]) and float(line["minutes"]) == minutes
+
+
+def as_table(lines: Path, minutes: Sequence[float], rules: Mapping[str, float]) -> list[str]:
+    """The table: libraries, and below them what needs no training."""
+    head = ("trainer", "reward", "seeds", *(f"{m:g} min" for m in minutes))
+    untaught = [
+        [name, "no training", "", *[""] * (len(minutes) - 1), f"{rules[name]:.2f}"]
+        for name in sorted(rules, key=lambda name: -rules[name])
+    ]
+    return table(head, [*rows(lines, minutes), *untaught])
+
+
+def renew(page: Path, made: Sequence[str]) -> None:
+    """Put the table between the page's two marks."""
+    text = page.read_text("utf-8")
+    if not 0 <= text.find(BEGIN) < text.find(END):
+        raise BufgymError(f"{page}: has no {BEGIN} with {END} below it")
+    before, after = text[: text.index(BEGIN)], text[text.index(END) :]
+    write_text(page, "\n".join([before + BEGIN, "", *made, "", after]))
+
+
+def fill(todo: Iterable[Training], minutes: Sequence[float], lines: Path, environments: Path, episodes: int) -> None:
+    """Train what is not complete in the file."""
+    lines.parent.mkdir(parents=True, exist_ok=True)
+    for training in todo:
+        done = read(lines).get(training, [])
+        if not is_complete(done, minutes[-1]):
+            if done:
+                forget(lines, training)
+            train(training, minutes, lines, environments, episodes)
 
 
 def page(
-    library: str,
-    reward: str = "regret",
-    minutes: float = 10.0,
-    out: Path = Path("runs/ten_minutes.csv"),
+    libraries: Sequence[str] = tuple(LIBRARIES),
+    rewards: Sequence[str] = ("regret", "paired"),
+    seeds: Sequence[int] = (0,),
+    minutes: Sequence[float] = MINUTES,
+    lines: Path = Path("runs/ten_minutes.csv"),
+    environments: Path = Path("runs/environments"),
     episodes: int = 40,
+    page: Path | None = None,
 ) -> None:
-    """Train with one library and append its score to ``out``."""
-    if library not in LIBRARIES:
-        raise unknown("library", library, LIBRARIES)
-    fixed = Episodes(episodes)
-    trained: Any = LIBRARIES[library](Budget(minutes), Task(reward))
-    score = fixed.of_model(trained)
-    print(f"{library}: {score:.3f}")
-    out.parent.mkdir(exist_ok=True)
-    append(out, LINE, (library, reward, f"{minutes:g}", f"{score:.4f}"))
+    """Train, or with ``page`` put the table into it."""
+    for name in libraries:
+        if name not in LIBRARIES:
+            raise unknown("library", name, LIBRARIES)
+    if page is not None:
+        fixed = Episodes(episodes)
+        renew(page, as_table(lines, minutes, {name: fixed.of_rule(rule) for name, rule in RULES.items()}))
+        return
+    todo = [Training(name, reward, seed) for seed in seeds for reward in rewards for name in libraries]
+    try:
+        with FileLock(f"{lines}.lock", timeout=0):
+            fill(todo, minutes, lines, environments, episodes)
+    except Timeout:
+        raise BufgymError(f"{lines}: another process fills it") from None
 
 
 if __name__ == "__main__":

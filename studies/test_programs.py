@@ -28,6 +28,7 @@ NEEDED = {
 }
 ELSEWHERE = {
     "studies.bounds": "studies/test_bounds.py",
+    "studies.budget": "studies/test_ten_minutes.py, and it needs the other libraries",
     "studies.coverage": "studies/test_coverage.py",
     "studies.fit": "studies/test_fit_page.py",
     "studies.fit_sizes": "studies/test_fit_sizes.py",
@@ -40,7 +41,7 @@ ELSEWHERE = {
     "studies.shipped": "studies/test_shipped.py",
     "studies.yardstick": "studies/test_yardstick.py",
     "studies.sizes": "needs a recording, and PyAV",
-    "studies.ten_minutes": "studies/test_ten_minutes.py, and it needs the other libraries",
+    "studies.ten_minutes": "studies/test_ten_minutes.py, and it trains for hours",
     "website.films": "website/test_gallery.py",
     "website.interfaces": "website/test_interfaces.py",
     "website.played": "website/test_played.py",
