@@ -119,6 +119,10 @@ class Kernel:
             self._codes[key] = found
         return found
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy of it, or one in another process, finds its code anew."""
+        return self.__dict__ | {"_codes": {}}
+
     def __repr__(self) -> str:
         return f"<kernel {self.py_func.__module__}.{self.py_func.__qualname__}>"
 
@@ -135,6 +139,10 @@ class Hook:
         self.address: int | None = address(function, pointer)
         self.key = str(pointer) if self.address is not None else f"{pointer} without an address"
         self._kernel = Kernel(function)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """An address holds in its own process alone."""
+        return Hook, (self.py_func, self.kind)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call it from Python, as the kernel that it is."""

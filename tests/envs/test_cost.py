@@ -1,6 +1,11 @@
 """The rewards ``cost`` and ``paired`` by hand and by their sums over whole episodes, and actions that hold."""
 
 import copy
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +16,7 @@ from refusal_cases import refused
 
 from bufgym import policies
 from bufgym.envs import FleetVecEnv, SenderEnv, SenderVectorEnv
+from bufgym.jit import kernel
 from bufgym.model import qoi
 from bufgym.model.link import Link
 from bufgym.scenario import Episode, Interruption, Uplink, messages
@@ -160,6 +166,35 @@ def test_a_copy_goes_on_by_itself() -> None:
     other = copy.deepcopy(env)
     first = [env.step(2)[1] for _ in range(6)]
     assert first == [other.step(2)[1] for _ in range(6)]
+
+
+@kernel
+def halved(x: float) -> float:
+    return x / 2
+
+
+def test_a_copied_rule_finds_its_code_anew() -> None:
+    assert halved(3.0) == copy.deepcopy(halved)(3.0) == 1.5
+
+
+GOES_ON = """
+import pickle, sys
+env = pickle.load(open(sys.argv[1], "rb"))
+print([env.step(2)[1] for _ in range(6)])
+"""
+
+
+def test_a_copy_goes_on_in_another_process(tmp_path: Path) -> None:
+    """There the rule's functions have other addresses."""
+    env = SenderEnv("lte", L, reward="paired", reference="gap-price")
+    env.reset(seed=0)
+    env.step(1)
+    (tmp_path / "env").write_bytes(pickle.dumps(env))
+    done = subprocess.run(
+        [sys.executable, "-c", GOES_ON, tmp_path / "env"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [env.step(2)[1] for _ in range(6)]
 
 
 def test_robots_of_a_cell_learn_from_their_cost() -> None:
