@@ -69,6 +69,7 @@ class TaughtRows:
                 decide_at="arrival",
                 actions="slots",
                 fields=("occupancy",),
+                reward="retained",  # nobody reads it, and the default plays a shadow beside each row
                 info="mask",
             )
             sub_envs = SubEnvs(part.rows, part.cell.scenario, options)
