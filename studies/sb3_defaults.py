@@ -116,7 +116,7 @@ class Episodes:
     def of_model(self, model: Model, actions: str = "candidates") -> float:
         """The score of a model's most likely actions."""
         n = len(self._episodes)
-        options: dict[str, Any] = {"actions": actions, "observation": "flat", "info": "mask"}
+        options: dict[str, Any] = {"actions": actions, "observation": "flat", "info": "mask", "reward": "retained"}
         envs = gym.make_vec(self._task.env, n, capacity=self._capacity, **options, **self._task.evaluation)
         observation, info = envs.reset(seed=0, options={"episodes": self._episodes})
         qoi, over = np.zeros(n), np.zeros(n, np.bool_)
