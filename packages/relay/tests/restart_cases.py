@@ -61,5 +61,7 @@ async def play(one: Field, rounds: int, seed: int, first: Sequence[str] = ()) ->
             await one.round(*first[k : k + 1])
     finally:
         print(f"seed {seed}: {dict(one.truth.counts)} {one.truth.wrong}", file=sys.stderr, flush=True)
-    assert one.truth.counts["rounds"] == rounds and one.truth.counts["velocities"]
+    counts = one.truth.counts
+    assert counts["rounds"] == rounds and counts["goals"] and counts["stops"]
+    assert counts["velocities"] or rounds < 10  # of two rounds on a busy machine each may have come too late
     return one.truth.counts
