@@ -232,13 +232,18 @@ def summary(curves: Path, steps: int, rules: Mapping[str, float]) -> list[str]:
 
 
 def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
-    """A line for each seed, a colour for each of the settings, and the rules as levels."""
-    figure = Figure(figsize=(7, 3.6), layout="constrained")
-    axes = figure.add_subplot(xlabel="steps", ylabel="score", ylim=(-0.2, 0.85))
+    """A thin line for each seed, the mean of those that ran longest, and the rules as levels; a colour for each run."""
+    figure = Figure(figsize=(7, 4.4), layout="constrained")
+    axes = figure.add_subplot(xlabel="steps", ylabel="score", ylim=(0.3, 0.8))
     for k, (one, of_seed) in enumerate(read(curves).items()):
-        for n, curve in enumerate(of_seed.values()):
-            steps, scores, _ = zip(*curve, strict=True)
-            axes.plot(steps, scores, color=f"C{k}", alpha=0.7, label=one.label if n == 0 else None)
+        scores = [{steps: score for steps, score, _ in curve} for curve in of_seed.values()]
+        for score_at in scores:
+            axes.plot(*zip(*score_at.items(), strict=True), color=f"C{k}", alpha=0.3, linewidth=0.7)
+        longest = [score_at for score_at in scores if max(score_at) >= 0.9 * max(map(max, scores))]
+        common = sorted(set.intersection(*map(set, longest)))
+        mean = [float(np.mean([score_at[steps] for score_at in longest])) for steps in common]
+        seeds = f", {len(longest)} seeds" * (len(longest) > 1)
+        axes.plot(common, mean, color=f"C{k}", linewidth=1.8, label=one.label + seeds)
     at_level: dict[float, list[str]] = {}
     for name, score in rules.items():
         at_level.setdefault(round(score, 2), []).append(name)  # closer ones would be written over each other
@@ -247,7 +252,7 @@ def draw_curves(curves: Path, rules: dict[str, float], out: Path) -> None:
         axes.annotate(
             ", ".join(names), (1, score), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8
         )
-    axes.legend(loc="lower right", frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     figure.savefig(out)
 
 
