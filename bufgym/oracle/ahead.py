@@ -96,10 +96,9 @@ def find_steps(batch: Batch, ahead: Ahead, i: int, place: int, rivals: Rivals) -
 
 
 @kernel
-def _gain(ahead: Ahead, i: int, rivals: Rivals, k: int, e: int) -> float:
-    """Gain by rival ``k`` if it follows a message that ends at byte ``e``."""
-    end = max(e, rivals.least[k]) + ahead.link[i, 0]
-    return float(rivals.added[k] + ahead.gain[step_of(ahead, i, rivals.message[k], end)])
+def _step(ahead: Ahead, i: int, rivals: Rivals, k: int, e: int) -> int:
+    """The step that rival ``k`` is on if it follows a message that ends at byte ``e``."""
+    return step_of(ahead, i, rivals.message[k], max(e, rivals.least[k]) + ahead.link[i, 0])
 
 
 @kernel
@@ -108,18 +107,25 @@ def _rank(ahead: Ahead, i: int, rivals: Rivals, new: int) -> int:
     k = new - 1
     while k >= 0:
         low, high = rivals.since[k], rivals.top[k]
-        if _gain(ahead, i, rivals, new, high) <= _gain(ahead, i, rivals, k, high) + TIE:
+        more, less = rivals.added[new], rivals.added[k] + TIE
+        step, other = _step(ahead, i, rivals, new, high), _step(ahead, i, rivals, k, high)
+        if more + ahead.gain[step] <= less + ahead.gain[other]:
             low = high + 1
-        elif _gain(ahead, i, rivals, new, low) > _gain(ahead, i, rivals, k, low) + TIE:
-            k -= 1
-            continue
-        else:  # it loses at ``low`` and wins at ``high``
+        else:
+            last, other_last = _step(ahead, i, rivals, new, low), _step(ahead, i, rivals, k, low)
+            if more + ahead.gain[last] > less + ahead.gain[other_last]:
+                k -= 1
+                continue
+            # It loses at ``low`` and wins at ``high``. Steps between lie between those of the two.
             while high - low > 1:
                 middle = (low + high) // 2
-                if _gain(ahead, i, rivals, new, middle) > _gain(ahead, i, rivals, k, middle) + TIE:
-                    high = middle
+                b = ahead.link[i, 0]
+                here = step_within(ahead, step, last + 1, max(middle, rivals.least[new]) + b)
+                there = step_within(ahead, other, other_last + 1, max(middle, rivals.least[k]) + b)
+                if more + ahead.gain[here] > less + ahead.gain[there]:
+                    high, step, other = middle, here, there
                 else:
-                    low = middle
+                    low, last, other_last = middle, here, there
             low = high
         if low > rivals.top[new]:
             return new
@@ -238,9 +244,14 @@ def _ends_before(ahead: Ahead, i: int, m: int, j: int) -> tuple[int, int]:
 @kernel
 def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
     """Index of the step that message ``m`` of sender ``i`` is on if it ends at byte ``e``."""
-    low, high = unchecked_at(ahead.begin, i, m), unchecked_at(ahead.stop, i, m)
+    return step_within(ahead, unchecked_at(ahead.begin, i, m), unchecked_at(ahead.stop, i, m), e)
+
+
+@kernel
+def step_within(ahead: Ahead, low: int, high: int, e: int) -> int:
+    """Likewise, of a message whose step is known to be one of ``low : high``."""
     while high - low > 1:
-        middle = (low + high) // 2
+        middle = (low + high) >> 1
         if ahead.latest[middle] >= e:
             low = middle
         else:
@@ -249,10 +260,11 @@ def step_of(ahead: Ahead, i: int, m: int, e: int) -> int:
 
 
 @kernel
-def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
+def sends(ahead: Ahead, i: int, m: int, e: int, steps: Ints) -> float:
     """Largest gain after message ``m`` if it is sent next, from byte ``e`` on, without its own gain.
 
-    -1 if it found no room; -2 if neither it nor any later message can be delivered any more.
+    -1 if it found no room; -2 if neither it nor any later message can be delivered any more. ``steps[m]`` is the step
+    of an earlier byte, or -1; it becomes this one's.
     """
     b, c = ahead.link[i, 0], unchecked_at(ahead.c, i, m)
     u = max(e, c)
@@ -261,4 +273,11 @@ def sends(ahead: Ahead, i: int, m: int, e: int) -> float:
     room = ahead.link[i, 1]
     if room == 0 or u - c > room * b:
         return -1.0
-    return float(ahead.gain[step_of(ahead, i, m, u + b)])
+    step = steps[m]
+    if step < 0:
+        step = step_of(ahead, i, m, u + b)
+    else:  # the first step of all is that of the latest bytes
+        while ahead.latest[step] < u + b:
+            step -= 1
+    steps[m] = step
+    return float(ahead.gain[step])

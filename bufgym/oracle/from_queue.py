@@ -28,6 +28,7 @@ class Work(NamedTuple):
     slots: Ints  # int64[L + 1], messages queued after the action
     arrived: Ints  # int64[L + 2], arrivals after the newcomer by the time of the t-th transmission
     future: Floats  # float64[messages], gain after each later arrival
+    steps: Ints  # int64[messages], the step that has it, see ``sends``
     places: Floats  # float64[L + 1 + messages], coordinate of each candidate of ``forced``
     best: Ints  # int64[L + 1 + messages], its best predecessor
     forced: Floats  # float64[2, L + 1 + messages], its gain
@@ -47,6 +48,7 @@ def new_work(capacity: int, messages: int) -> Work:
         np.zeros(L + 1, np.int64),
         np.zeros(L + 2, np.int64),
         np.zeros(messages),
+        np.zeros(messages, np.int64),
         np.zeros(L + 1 + messages),
         np.zeros(L + 1 + messages, np.int64),
         np.zeros((2, L + 1 + messages)),
@@ -147,7 +149,7 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
         work.first[k] = value(v, x - last_x) if sent else 1.0  # the very first message gains the 1 in H
         for j in range(k):
             work.pair[j, k] = value(v, x - work.x[j])
-    count, chosen = 0, n + 1
+    count, chosen, known = 0, n + 1, n
     for t in range(1, own + 2):
         if t <= own:
             while n + 1 + count < sender.arrivals and unchecked_at(ahead.c, i, n + 1 + count) < e + (t - 1) * b:
@@ -168,7 +170,10 @@ def look(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
         # Nothing follows the newcomer best: later messages are like it. Of these the first that finds room will do.
         alike = last < 0
         for m in range(chosen, sender.arrivals if alike else last + 1):
-            work.future[m] = sends(ahead, i, m, u)
+            while known < m:
+                known += 1
+                work.steps[known] = -1
+            work.future[m] = sends(ahead, i, m, u, work.steps)
             last = max(last, m)
             if alike and work.future[m] != -1:
                 break
@@ -196,7 +201,8 @@ def look_ahead(batch: Batch, ahead: Ahead, work: Work, i: int, e: int) -> None:
     for m in range(n + 1, sender.arrivals):
         if unchecked_at(ahead.between, i, m) > n and unchecked_at(ahead.idle, i, m) >= e:
             break  # another message could be sent in the meantime
-        after = sends(ahead, i, m, e)
+        work.steps[m] = -1
+        after = sends(ahead, i, m, e, work.steps)
         if after < -1 or (after >= 0 and after + 1 <= most):
             break  # a later message has no larger gain after it
         if after >= 0:
