@@ -41,7 +41,7 @@ in_ros = pytest.mark.skipif(NO_ROS, reason=needs("ros2" if JIT else "compiled"))
 def run(*words: object) -> str:
     where = {
         **os.environ,
-        "PYTHONPATH": f"{REPO}:{REPO / 'packages' / 'live'}",
+        "PYTHONPATH": f"{REPO}:{REPO / 'packages' / 'robot'}",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
     return played(where, *words)
@@ -193,6 +193,28 @@ def test_x_of_a_ruled_topic_is_the_nodes_time() -> None:
     for now_ns[0] in (7_000_000_000, 7_500_000_000, 0):
         seen.append(place.x(SimpleNamespace(get_clock=lambda: clock), None))
     assert seen == [0, 5, 5]
+
+
+def test_a_topic_that_a_receiver_publishes_beside_others_is_left_out() -> None:
+    """In one domain the relay would hear its copies and send them again, round and round, until the receiver goes."""
+    found = {"/camera": "camera", "/commands": "bufgym_receive"}
+    offers = {name: [SimpleNamespace(node_name=whose)] for name, whose in found.items()}
+    node = SimpleNamespace(get_publishers_info_by_topic=lambda name: offers[name])
+    said: list[str] = []
+    robot = RosSender(None, "127.0.0.1", 1, topics=["/camera", "/commands"], say=said.append)
+    fits = []
+    alone = offers["/camera"]
+    for now in ([*alone, SimpleNamespace(node_name="bufgym_receive_1")], alone):
+        offers["/camera"] = now
+        for _ in range(2):  # looked at twice, told once
+            robot._look_for_circles(node, list(offers))
+        fits.append([robot._fits(name, b"head", b"image") for name in offers])
+    assert fits == [[False, True], [True, True]]
+    assert said == [
+        "/camera: left out: bufgym_receive_1 publishes it in this domain, too, and its copies would be sent again: "
+        "give bufgym_receive_1 another ROS_DOMAIN_ID, or start it with --ros-args -r /camera:=/base/camera",
+        "/camera: no longer left out",
+    ]
 
 
 def test_topics_that_cannot_be_relayed() -> None:

@@ -147,6 +147,19 @@ def _publishers(node: Any, name: str, but_not: str) -> list[Any]:
     return [one for one in node.get_publishers_info_by_topic(name) if but_not not in one.node_name]
 
 
+def circle(node: Any, name: str, receivers: str) -> str:
+    """Say why sending the topic would send its copies again, too; "" if it would not.
+
+    A node with ``receivers`` in its name publishes it beside others, in this node's domain.
+    """
+    nodes = [one.node_name for one in node.get_publishers_info_by_topic(name)]
+    again = next((one for one in nodes if receivers in one), "")
+    if not again or all(receivers in one for one in nodes):
+        return ""
+    remedy = f"give {again} another ROS_DOMAIN_ID, or start it with --ros-args -r {name}:=/base{name}"
+    return f"{again} publishes it in this domain, too, and its copies would be sent again: {remedy}"
+
+
 def published(node: Any, name: str, but_not: str) -> Published | None:
     """Find the topic as the node sees it; None while only nodes with ``but_not`` in their names publish it.
 

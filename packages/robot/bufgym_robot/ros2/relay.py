@@ -27,7 +27,7 @@ from bufgym_robot.latched import Latched
 from bufgym_robot.receiver import Receiver
 from bufgym_robot.ros2.diagnostics import Diagnostics, publisher
 from bufgym_robot.ros2.mismatch import of_subscription
-from bufgym_robot.ros2.names import Published, needs_rclpy, overriding, published, publishers, resolved
+from bufgym_robot.ros2.names import Published, circle, needs_rclpy, overriding, published, publishers, resolved
 from bufgym_robot.ros2.places import left_out, places
 from bufgym_robot.ros2.republishing import HOLD_S, Republisher
 from bufgym_robot.ros2.taking import Hearing, call_events, source_of, take_all, untaken
@@ -38,7 +38,7 @@ from bufgym_robot.wire.sockets import BACKOFF_S, host_port
 from bufgym_robot.wire.tasks import until_one_ends
 
 SENDER, RECEIVER = "bufgym_send", "bufgym_receive"
-"""Names of the nodes. A sender ignores topics of a receiver, so a pair each way makes no loop."""
+"""Names of the nodes. A sender sends no topic that a receiver publishes, so a pair each way makes no circle."""
 LOOK_S: Final = 0.2  # Time between two searches for publishers
 TELL_S: Final = 1.0  # Time between two messages on /diagnostics
 LATCHED_DEPTH: Final = 1000  # Messages of a latched topic that wait to be taken: more than it has publishers
@@ -181,6 +181,7 @@ class RosSender:
         self.sender = Sender(self.queue, connect, leaves, self._on_connection, self.latched)
         self._depth = capacity
         self._left_out: set[str] = set()
+        self._circles: set[str] = set()
         self._too_large: set[str] = set()
         self._odometry_topic: str | None
         self._odometry_topic, self._odometry = (None, Odometry()) if odometry is None else followed(odometry)
@@ -228,10 +229,24 @@ class RosSender:
                     self._left_out.add(name)
                     self._say(f"{name}: left out: {why}")
         names = [place.name for place in self._places if place.name is not None]
+        self._look_for_circles(node, names)
         return names if self._odometry_topic is None else [*names, self._odometry_topic]
+
+    def _look_for_circles(self, node: Any, names: Sequence[str]) -> None:
+        """Leave topics out while their copies would be sent again."""
+        for name in names:
+            why = circle(node, name, RECEIVER)
+            if why and name not in self._circles:
+                self._circles.add(name)
+                self._say(f"{name}: left out: {why}")
+            elif not why and name in self._circles:
+                self._circles.remove(name)
+                self._say(f"{name}: no longer left out")
 
     def _fits(self, name: str, head: bytes, message: bytes) -> bool:
         """Whether a receiver takes such a message with its topic's head; says so once for each topic if not."""
+        if name in self._circles:
+            return False
         most_bytes = MAX_BODY_BYTES - len(head)
         if len(message) > most_bytes and name not in self._too_large:
             self._too_large.add(name)
