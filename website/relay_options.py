@@ -21,8 +21,8 @@ PAGE: Final = Path(__file__).resolve().parent.parent / "docs/guide/relay-options
 HEAD: Final = """# A relay's rules and options
 
 A relay reads one TOML file, as [`examples/relay.toml`](../../examples/relay.toml). File names in it are relative to it.
-`bufgym relay serve --config relay.toml --check` names the first fault and idle rules. On SIGHUP a relay rereads rules, certificates
-and the issuer's keys, and says which other changes need a restart.
+`bufgym relay serve --config relay.toml --check` names the first fault and idle rules. On SIGHUP a relay rereads rules,
+certificates and the issuer's keys, and says which other changes need a restart.
 """
 
 RULES: Final = """What no rule allows is denied. A rule has one identity (the first five keys) and
