@@ -21,12 +21,12 @@ PAGE: Final = Path(__file__).resolve().parent.parent / "docs/guide/relay-options
 HEAD: Final = """# A relay's rules and options
 
 A relay reads one TOML file, as [`examples/relay.toml`](../../examples/relay.toml). File names in it are relative to it.
-`bufgym relay serve --config relay.toml --check` names the first fault. On SIGHUP a relay rereads rules, certificates
-and the issuer's keys, and says which other changes need a restart.
+`bufgym relay serve --config relay.toml --check` names the first fault and idle rules. On SIGHUP a relay rereads rules,
+certificates and the issuer's keys, and says which other changes need a restart.
 """
 
-RULES: Final = """Everything that no rule allows is denied. A rule has one identity (the first five keys) and
-allows `send`, `receive` or both. Patterns are [RE2](https://github.com/google/re2/wiki/Syntax)'s and must match the
+RULES: Final = """What no rule allows is denied. A rule has one identity (the first five keys) and
+allows `send`, `receive` or both. [RE2](https://github.com/google/re2/wiki/Syntax) patterns match the
 whole topic. Whoever may send `command` to a robot may stop and release it. The first rule that lets a message be sent
 gives its `command_s` and `speed`.
 """

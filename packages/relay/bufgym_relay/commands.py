@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bufgym.cli.options import PortNumber
+from bufgym.utils.errors import BufgymError
 from bufgym_robot.wire.options import SessionOptions
 
 
@@ -19,16 +20,21 @@ async def serve(*, config: str, check: bool = False) -> None:
 
     Args:
         config: As examples/relay.toml.
-        check: Only read it and print its permissions.
+        check: Only read it and the files that it names, and print the first fault.
     """
     from bufgym_relay import config as configurations
-    from bufgym_relay import policies, server
+    from bufgym_relay import server
+    from bufgym_relay.faults import doubts
 
     settings = configurations.load(config)
     if check:
-        for name in settings.policies:
-            policies.policy(name)  # raises an error if there is none
+        try:
+            server.check(settings)
+        except BufgymError as error:
+            raise BufgymError(f"{config}: {error}") from None
         print(f"{config}: {len(settings.rules)} rules, {settings.host}:{settings.port}")
+        for doubt in doubts(settings):
+            print(f"{config}: {doubt}")
         return
     await server.serve_forever(settings, partial(print, flush=True), partial(configurations.load, config))
 

@@ -4,6 +4,7 @@ Whatever no rule allows is denied, so a configuration without rules serves nobod
 """
 
 import ipaddress
+import re
 from pathlib import Path
 from typing import Annotated, Any, Final
 from urllib.parse import urlsplit
@@ -71,16 +72,33 @@ class Rule(Section, frozen=True, kw_only=True):
         if self.address:
             try:
                 ipaddress.ip_network(self.address)
-            except ValueError as error:
-                raise BufgymError(f"rule: address = {self.address!r}: {error}") from None
+            except ValueError:
+                raise BufgymError(f"rule: address = {self.address!r}: {_address_rule(self.address)}") from None
         if not self.email.isprintable():
             raise BufgymError(f"rule: email = {self.email!r}: must be a text")
-        pattern(self.topic)
+        _check_pattern("topic", self.topic)
 
     @property
     def own(self) -> str:
         """The relay's own part that the rule is for, "recorder", "foxglove" or "nats"; empty for a client."""
         return next((part for part in ("recorder", "foxglove", "nats") if getattr(self, part)), "")
+
+
+def _address_rule(text: str) -> str:
+    """Say what an address must be that is none."""
+    try:
+        network = ipaddress.ip_network(text, strict=False)
+    except ValueError:
+        return "must be an IP address or a range as 10.0.0.0/8"
+    return f"is within a range; did you mean the range '{network}' or the address {text.partition('/')[0]!r}?"
+
+
+def _check_pattern(name: str, text: str) -> None:
+    """Refuse what RE2 or a client cannot read, naming the key."""
+    try:
+        pattern(text)
+    except BufgymError as error:
+        raise BufgymError(f"{name}: {error}") from None
 
 
 class Limits(Section, frozen=True):
@@ -199,9 +217,9 @@ def _is_safe(url: str) -> bool:
 class Nats(Section, frozen=True):
     """A NATS server with JetStream, over which relays share messages (extra ``mesh``)."""
 
-    url: Annotated[str, Meta(pattern="^(nats|tls)://[^/ ]+$")]
+    url: str
     """``nats://HOST:PORT`` or ``tls://HOST:PORT``, with JetStream."""
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{1,32}$")]
+    name: str
     """This relay's name, which no other relay has."""
     credentials: str = ""
     """File of a user's credentials (``.creds``)."""
@@ -211,6 +229,10 @@ class Nats(Section, frozen=True):
     """Delay beyond the usual after which an ordinary message is dropped, s."""
 
     def __post_init__(self) -> None:
+        if re.fullmatch("(nats|tls)://[^/ ]+", self.url) is None:
+            raise BufgymError(f"nats: url = {self.place!r}: must be nats://HOST:PORT or tls://HOST:PORT")
+        if re.fullmatch("[A-Za-z0-9_-]{1,32}", self.name) is None:
+            raise BufgymError(f"nats: name = {self.name!r}: must be 1 to 32 letters, digits, _ or -")
         try:
             _ = urlsplit(self.url).port
         except ValueError:
@@ -220,8 +242,8 @@ class Nats(Section, frozen=True):
     @property
     def place(self) -> str:
         """The URL without its user and password."""
-        scheme, _, rest = self.url.partition("://")
-        return f"{scheme}://{rest.rpartition('@')[2]}"
+        scheme, mark, rest = self.url.rpartition("://")
+        return f"{scheme}{mark}{rest.rpartition('@')[2]}"
 
 
 class Foxglove(Section, frozen=True):
@@ -275,8 +297,13 @@ class Config(Section, frozen=True, kw_only=True):
     foxglove: Foxglove | None = None
 
     def __post_init__(self) -> None:
-        for text in self.no_drop + self.latched:
-            pattern(text)
+        for name in ("no_drop", "latched"):
+            for text in getattr(self, name):
+                _check_pattern(name, text)
+        for origin in self.origins:
+            scheme, _, place = origin.partition("://")
+            if scheme not in ("http", "https") or not place or set(place) & set("/ ,*"):
+                raise BufgymError(f"origins = {origin!r}: must be as https://example.org, without a path")
 
 
 def load(path: str | Path) -> Config:
@@ -289,12 +316,15 @@ def load(path: str | Path) -> Config:
     def read(kind: Any, value: Any) -> Any:
         if kind is Path and isinstance(value, str):
             return folder / value
-        raise BufgymError(f"{value!r}: must be a text")
+        raise BufgymError("must be a text in quotes")
 
+    table = read_toml(path)
     try:
-        config = msgspec.convert(read_toml(path), Config, dec_hook=read)
+        config = msgspec.convert(table, Config, dec_hook=read)
     except msgspec.ValidationError as error:
-        raise BufgymError(f"{path}: {error}") from None
+        from bufgym_relay.faults import fault  # not at start-up: few files have one
+
+        raise fault(path, table, error) from None
     return replace(
         config,
         tls=_beside(folder, config.tls, "certificate", "key", "clients"),

@@ -105,6 +105,9 @@ def server_context(tls: Tls) -> ssl.SSLContext:
 
 def renew(context: ssl.SSLContext, tls: Tls) -> None:
     """Read the files again, for connections from now on; if they cannot be read, all stays as it is."""
+    for key in ("certificate", "key", "clients"):
+        if getattr(tls, key) and not Path(getattr(tls, key)).is_file():
+            raise BufgymError(f"tls: {key} = {getattr(tls, key)!r}: no such file")
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(tls.certificate, tls.key)
         context.load_cert_chain(tls.certificate, tls.key)

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from http import HTTPStatus
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from msgspec.structs import replace
@@ -27,6 +28,7 @@ from bufgym_relay.admission import Accepted, Admission
 from bufgym_relay.caller import Caller
 from bufgym_relay.config import POLICIES, Config
 from bufgym_relay.connection import HELLO_BYTES, Connection
+from bufgym_relay.faults import doubts
 from bufgym_relay.hub import CONNECTED, STATUS, Hub
 from bufgym_relay.identity import Verifier, renew, server_context
 from bufgym_relay.robofleet import RobofleetConnection
@@ -128,9 +130,7 @@ class Server:
         return int(next(iter(self._server.sockets)).getsockname()[1])
 
     def _warm(self) -> None:
-        for name in self.config.policies:
-            if name not in POLICIES:
-                policies.policy(name)  # raises an error if there is none
+        _check_policies(self.config)
         policies.warm(self.config.policies[0])
 
     async def warm(self) -> None:
@@ -254,6 +254,22 @@ def _fitted(config: Config, say: Any) -> Config:
     return config
 
 
+def _check_policies(config: Config) -> None:
+    """Raise a BufgymError for a name of ``policies`` that none has."""
+    for name in config.policies:
+        if name not in POLICIES:
+            policies.policy(name)
+
+
+def check(config: Config) -> None:
+    """Raise a BufgymError for an unknown policy, and for files of ``[tls]`` and ``[tokens]`` that cannot be read."""
+    _check_policies(config)
+    if config.tls is not None:
+        server_context(config.tls)
+    if config.tokens is not None and "://" not in config.tokens.keys and not Path(config.tokens.keys).is_file():
+        raise BufgymError(f"tokens: keys = {config.tokens.keys!r}: no such file")
+
+
 async def serve_forever(config: Config, say: Any = print, load: Callable[[], Config] | None = None) -> None:
     """Run a relay until cancelled, or until the process gets SIGTERM; at SIGHUP it rereads what ``load`` gives."""
     sys.setswitchinterval(SWITCH_S)
@@ -263,6 +279,8 @@ async def serve_forever(config: Config, say: Any = print, load: Callable[[], Con
     say(f"{scheme}://{config.host}:{port}/ is the page, {wire.PATH} for robots; Ctrl-C ends it")
     if config.folder is None:
         say("no folder: what is held, and stops of robots that are away, end with the relay")
+    for doubt in doubts(config):
+        say(doubt)
     if server.hub.peers is not None and server.hub.peers.state != CONNECTED:
         say(f"{server.hub.peers.state}; goes on without the other relays until NATS is there")
     if server.window is not None:
@@ -277,6 +295,8 @@ async def serve_forever(config: Config, say: Any = print, load: Callable[[], Con
         else:
             more = f"; a restart is needed for: {', '.join(others)}" if others else ""
             say(f"reread: {len(server.config.rules)} rules, keys and certificate{more}")
+            for doubt in doubts(server.config):
+                say(doubt)
 
     with contextlib.suppress(
         AttributeError, NotImplementedError, RuntimeError, ValueError
