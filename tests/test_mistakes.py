@@ -35,6 +35,10 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
         ("trace convert lte-synthetic-0 --out", "--out requires an argument"),
         ("leaderboard --suite outage", "unknown suite 'outage'; did you mean 'outage-v1'?"),
         ("--verison", "unknown option '--verison'; did you mean '--version'?"),
+        ("bench --scenario LTE", "unknown scenario 'LTE'; did you mean 'lte'?"),
+        ("list rewards x", "error: x: one word too many; --help says what the command takes"),
+        ("bench --trace 4Mbits --policies afr", "a steady link is as in 4Mbit/s"),
+        ("bench --policies afr --out table.tex", 'for LaTeX bufgym.compare(...).table("latex")'),
         ("play --speed 0", "--speed: 0: must be a number from 0.01 to 1000"),
         ("leaderboard outage", "unknown suite 'outage'; did you mean 'outage-v1'?"),
         ("bench --capacity 4 4", "--capacity 4,4: must be whole numbers >= 1, no two alike"),
@@ -75,6 +79,21 @@ QUICK = ["bench", "--trace", "lte-synthetic-0", "--seconds", "1", "--fps", "10",
 )
 def test_a_mistake_ends_in_a_sentence(command: str, message: str, capsys: Capsys) -> None:
     fails(command.split(), message, capsys)
+
+
+@pytest.mark.parametrize(
+    ("argument", "says"),
+    [
+        ({"L": 8}, "unknown argument 'L'; did you mean 'capacity'"),
+        ({"fps": 30}, "did you mean 'rate_hz'"),
+        ({"size": 460_800}, "did you mean 'size_bytes'"),
+        ({"seed": 0}, r"a seed goes to reset\(seed=...\)"),
+        ({"suite": "lte-v1"}, "bufgym/Suite-v1 takes it"),
+    ],
+)
+def test_an_argument_by_another_name_is_understood(argument: dict[str, Any], says: str) -> None:
+    with pytest.raises(TypeError, match=says):
+        gym.make("bufgym/Uplink-v1", **argument)
 
 
 RULE = """

@@ -42,7 +42,8 @@ def checked_target(path: str | os.PathLike[str]) -> Path:
     """Return the path; raise an error if rows can't be written to a file of that kind here."""
     target = Path(path)
     if target.suffix not in (".csv", ".parquet"):
-        raise BufgymError(f"{target}: rows are written to .csv or .parquet files")
+        latex = '; for LaTeX bufgym.compare(...).table("latex")' if target.suffix == ".tex" else ""
+        raise BufgymError(f"{target}: rows are written to .csv or .parquet files{latex}")
     if target.suffix == ".parquet":
         _pyarrow()
     return target

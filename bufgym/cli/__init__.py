@@ -14,7 +14,14 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from typing import Any
 
-from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnknownOptionError
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
 
 from bufgym.cli.options import OPTIONS
 from bufgym.utils import __version__, modules, packages
@@ -121,6 +128,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(_missing(error))
     except (UnknownCommandError, UnknownOptionError) as error:
         return _failed(_unknown(error, words[0]))
+    except UnusedCliTokensError as error:
+        return _failed(f"{' '.join(error.unused_tokens or ())}: one word too many; --help says what the command takes")
     except (BufgymError, CycloptsError) as error:
         return _failed(str(error))
     except OSError as error:

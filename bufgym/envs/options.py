@@ -138,6 +138,18 @@ class Options:
 
 _NAMES = tuple(field.name for field in fields(Options))
 _OF_BATCHES = ("max_episode_steps", "autoreset_mode")
+_MEANT = {
+    "L": "did you mean 'capacity'?",
+    "buffer_size": "did you mean 'capacity'?",
+    "fps": "did you mean 'rate_hz'?",
+    "seconds": "did you mean 'duration_s'?",
+    "size": "did you mean 'size_bytes'?",
+    "bytes": "did you mean 'size_bytes'?",
+    "seed": "a seed goes to reset(seed=...)",
+    "suite": "bufgym/Suite-v1 takes it",
+    "split": "bufgym/Suite-v1 takes it",
+}
+"""What else one may call an argument, or where it goes -> the words that say so."""
 
 
 def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
@@ -150,6 +162,8 @@ def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
     for name in arguments:
         if name not in known:
             ours = str(unknown("argument", name, [*known, *_NAMES, *_OF_BATCHES]))
+            if name in _MEANT:
+                ours = f"unknown argument {name!r}; {_MEANT[name]}"
             if name in _OF_BATCHES:
                 ours = f"a batch takes it; Gymnasium's SyncVectorEnv by vector_kwargs={{{name!r}: ...}}"
             raise UnknownArgumentError(

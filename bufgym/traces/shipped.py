@@ -69,7 +69,14 @@ def load(
     rate = None if Path(name_or_path).exists() else rate_of(os.fspath(name_or_path))
     if rate is not None:
         return replace(steady(rate), name=os.fspath(name_or_path))
-    return read_trace(_resolve(name_or_path), format, after, column=column, columns=columns, holes=holes)
+    return read_trace(
+        _resolve(name_or_path, "; a steady link is as in 4Mbit/s"),
+        format,
+        after,
+        column=column,
+        columns=columns,
+        holes=holes,
+    )
 
 
 def load_motion(name_or_path: StrPath) -> Motion:
@@ -77,11 +84,11 @@ def load_motion(name_or_path: StrPath) -> Motion:
     return read_motion(_resolve(name_or_path))
 
 
-def _resolve(name_or_path: StrPath) -> StrPath:
+def _resolve(name_or_path: StrPath, also: str = "") -> StrPath:
     paths = shipped()
     if isinstance(name_or_path, str) and name_or_path in paths:
         return paths[name_or_path]
     if not Path(name_or_path).exists():
         names = ", ".join(paths) or "none found"
-        raise fault(name_or_path, f"no such file, and no shipped trace (known: {names})")
+        raise fault(name_or_path, f"no such file, and no shipped trace (known: {names}){also}")
     return name_or_path

@@ -54,8 +54,9 @@ def unknown(what: str, name: object, known: Iterable[str], also: str = "", place
     import difflib  # not at start-up: few names are wrong
 
     names = list(known)
-    close = difflib.get_close_matches(str(name), names, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{also}"
+    small = {each.lower(): each for each in reversed(names)}  # LTE is meant as lte
+    close = difflib.get_close_matches(str(name).lower(), small, 1)
+    hint = f"did you mean {small[close[0]]!r}?" if close else f"known: {', '.join(names) or 'none'}{also}"
     return BufgymError(f"{place and f'{place}: '}unknown {what} {name!r}; {hint}")
 
 
