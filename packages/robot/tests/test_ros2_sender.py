@@ -237,6 +237,19 @@ async def test_the_nodes_life(node: Path, tmp_path: Path) -> None:
     assert [len(parse(message.body)[1]) for message in second[-2:]] == [50, 60]  # before them what was on its way
 
 
+async def test_a_topic_that_a_receiver_publishes_beside_others_is_left_out(node: Path) -> None:
+    """The node lets its subscription go while its own copies would come back, and then makes a new one."""
+    async with talking(node) as one:
+        assert await made(one, "topics=[camera]") == 1
+        kept, let_go = (["/robot/camera", HEAD.type, 300, 0, held] for held in (1, 0))
+        assert await said(one, "pass 0.4") == [kept]
+        await said(one, f"offer /robot/camera {HEAD.type} bufgym_receive reliable 300")
+        assert await said(one, "pass 0.4") == [let_go]
+        await said(one, "gone /robot/camera bufgym_receive")
+        assert await said(one, "pass 0.4") == [let_go, kept]
+        assert await said(one, "end") == 1
+
+
 async def test_wrong_parameters_are_one_line(node: Path) -> None:
     """The program prints it and ends with code 2; a container fails to load the node."""
     for given, why in (

@@ -246,6 +246,11 @@ private:
     {
       try
       {
+        if (const std::string why = circle(*this, name); !why.empty())
+        {
+          let_go(name);
+          throw std::runtime_error(why);
+        }
         Published topic;
         std::set<uint64_t> living;
         const auto known = sendings_.find(name);
@@ -263,10 +268,21 @@ private:
     }
   }
 
+  // End a topic's sending, also where an executor still holds its subscription.
+  void let_go(const std::string &name)
+  {
+    const auto known = sendings_.find(name);
+    if (known == sendings_.end())
+      return;
+    known->second.subscription.reset();
+    known->second.sender->close(0);
+    sendings_.erase(known);
+  }
+
   void subscribe(const Published &topic)
   {
     const rclcpp::QoS qos = subscription_qos(*this, topic, capacity_);
-    sendings_.erase(topic.name);  // its publishers came back with another type or quality of service
+    let_go(topic.name);  // its publishers came back with another type or quality of service
     Sending sending;
     sending.topic = topic;
     sending.sender = std::make_shared<Sender>(address(), topic, *policy_, capacity_, get_parameter("log").as_string());

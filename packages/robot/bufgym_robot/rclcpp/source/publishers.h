@@ -18,7 +18,7 @@ namespace bufgym
 {
 using Node = rclcpp_lifecycle::LifecycleNode;
 
-// In the node's name of a receiver, whose topics are never sent on, so that two pairs make no circle.
+// In the node's name of a receiver. No topic that a receiver publishes is sent, so that two pairs make no circle.
 const char *const RECEIVER = "bufgym_receive";
 const size_t LATCHED_DEPTH = 1000;  // messages of a latched topic that wait to be taken: more than it has publishers
 const int64_t LONGEST_NS = INT64_C(1) << 62;
@@ -54,6 +54,22 @@ auto with_publisher(Take take)
   };
 }
 #endif
+
+// Say why sending the topic would send its copies again, too: a receiver publishes it beside others. Empty if not.
+inline std::string circle(const Node &node, const std::string &name)
+{
+  std::string again;
+  bool others = false;
+  for (const rclcpp::TopicEndpointInfo &one : node.get_publishers_info_by_topic(name))
+    if (one.node_name().find(RECEIVER) == std::string::npos)
+      others = true;
+    else
+      again = one.node_name();
+  if (again.empty() || !others)
+    return "";
+  return again + " publishes it in this domain, too, and its copies would be sent again: give " + again +
+         " another ROS_DOMAIN_ID, or start it with --ros-args -r " + name + ":=/base" + name;
+}
 
 // Describe the topic by the weakest promise of any of its publishers, and name these; false if there is none.
 inline bool published(
