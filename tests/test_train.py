@@ -14,7 +14,7 @@ from train_cases import KilledError, columns, in_a_folder_of_its_own  # noqa: F4
 import train
 from agents import held_out, ppo, runs
 from agents.callbacks import Curve, checkpoints
-from agents.constants import NAMES
+from agents.constants import NAMES, UNTAUGHT
 from agents.held_out import FixedEpisodes
 from agents.hindsight_network import Student
 from agents.learner import learner_of
@@ -187,7 +187,9 @@ def test_a_suite_is_trained_validated_and_tested_on(algo: str, capsys: Capsys) -
     results = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     agent = f"agent ({SUITE[algo].algo})"
     standings = {standing["policy"]: standing for standing in results["standings"]}
-    assert set(standings) == {*registry.names(for_topics=False), agent} and not standings[agent]["unranked_because"]
+    untaught = [policy.name for policy in UNTAUGHT]
+    assert set(standings) == {*registry.names(for_topics=False), *untaught, agent}
+    assert not standings[agent]["unranked_because"]
     assert {cell["exact"] for cell in results["cells"]} == {True}
     assert results["held_out"] == {"suite": "interruption-v1", "split": "test", "episodes": 60}
     # The columns of the benchmark, and the training seed: none for a fixed policy.
