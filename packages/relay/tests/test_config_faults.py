@@ -4,9 +4,10 @@ import asyncio
 from pathlib import Path
 
 import pytest
+from needs import needs
 
-pytest.importorskip("re2")
-pytest.importorskip("websockets")
+pytest.importorskip("re2", reason=needs("extras", "re2"))
+pytest.importorskip("websockets", reason=needs("extras", "websockets"))
 
 from bufgym.utils.errors import BufgymError
 from bufgym_relay import commands
