@@ -27,10 +27,12 @@ class Turns:
         long, self._long = self._long, {}
         return long
 
-    @types.coroutine
-    def of(self, who: str, begin: Callable[[], Coroutine[Any, Any, Any]]) -> Generator[Any, Any, Any]:
+    async def of(self, who: str, begin: Callable[[], Coroutine[Any, Any, Any]]) -> Any:
         """Do the work that ``begin`` returns, unless this is cancelled before; note each of its turns."""
-        work = begin()
+        return await self._turn_by_turn(who, begin())
+
+    @types.coroutine  # Since Python 3.12 no task takes it itself
+    def _turn_by_turn(self, who: str, work: Coroutine[Any, Any, Any]) -> Generator[Any, Any, Any]:
         resume: Callable[[Any], Any] = work.send
         value: Any = None
         while True:

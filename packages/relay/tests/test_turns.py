@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import inspect
 import json
 import resource
 import threading
@@ -222,3 +223,15 @@ async def test_others_have_a_turn_between_two_pieces() -> None:
         async for _ in caller._pieces("x" * 10 * caller.PIECE):
             before, had = had, 0
     assert before == 1
+
+
+async def test_work_in_turns_is_a_coroutine_that_a_task_takes() -> None:
+    """Python 3.12 and later take nothing else, and the relay would serve nobody."""
+
+    async def work() -> int:
+        await asyncio.sleep(0)
+        return 7
+
+    made = turns.Turns().of("a", work)
+    assert inspect.iscoroutine(made)
+    assert await asyncio.create_task(made) == 7
