@@ -19,6 +19,7 @@ from msgspec.structs import replace
 from websockets.asyncio.server import Server as WebSocketServer
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import NegotiationError
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
@@ -183,7 +184,12 @@ class Server:
         assert isinstance(accepted, Accepted)
         ours = _is_ours(accepted.request)
         caller = Caller(self.hub, accepted, self._verifier, listens=ours)
-        await connection.serve(Connection if ours else RobofleetConnection, caller, accepted.greeted)
+        try:
+            await connection.serve(Connection if ours else RobofleetConnection, caller, accepted.greeted)
+        except Exception:
+            with self.hub.outliving("connection"):
+                raise
+            await accepted.close(CloseCode.INTERNAL_ERROR)
 
     def _subprotocol(self, socket: ServerConnection, offered: Sequence[Subprotocol]) -> Subprotocol | None:
         if not _is_ours(socket.request):

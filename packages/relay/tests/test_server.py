@@ -12,6 +12,7 @@ import pytest
 from cli_cases import fails
 from loop_cases import beside
 from relay_cases import Client, Corner, client, nothing, relay, settings, until, wait
+from websockets.exceptions import ConnectionClosedError
 
 from bufgym.policies import Policy
 from bufgym.utils.errors import BufgymError
@@ -249,3 +250,16 @@ async def test_a_port_that_is_taken() -> None:
         with pytest.raises(BufgymError, match=r"127\.0\.0\.1"):
             await other.start()
         await other.close()
+
+
+async def test_a_fault_of_the_relay_ends_a_connection_and_is_logged(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run(*_: object) -> None:
+        raise TypeError("a coroutine was expected")
+
+    async with relay() as server:
+        monkeypatch.setattr(serving.Connection, "run", run)
+        with pytest.raises(ConnectionClosedError, match="1011"):
+            async with client(server.port):
+                pass
+        (said,) = [entry for entry in server.hub.audit.recent if entry["event"] == "failed"]
+        assert (said["part"], said["why"]) == ("connection", "TypeError: a coroutine was expected")
