@@ -50,6 +50,27 @@ _ADDED: Final = {
 _COLUMNS: Final = "id, name, address, email, temporary, received, numbered, robot"
 
 
+def _opened(path: str) -> sqlite3.Connection:
+    """Open a store, made new or of an earlier release; a sqlite3.Error if it is none, or damaged, or another's."""
+    db = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
+    try:
+        for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
+            db.execute(f"PRAGMA {pragma}")
+        db.executescript(_SCHEMA)
+        for table, columns in _ADDED.items():
+            for column in columns:
+                with suppress(sqlite3.OperationalError):  # it is there
+                    db.execute(f"ALTER TABLE {table} ADD COLUMN {column}")
+        db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
+        (state,) = db.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise sqlite3.DatabaseError(" ".join(state.split()))
+    except sqlite3.Error:
+        db.close()
+        raise
+    return db
+
+
 class Held:
     """The file, or memory without a folder. After the start, all methods run in the thread of ``disk``.
 
@@ -60,18 +81,7 @@ class Held:
         self._limits, self._disk, self._audit, self._tell = config.store, disk, audit, tell
         path = ":memory:" if config.folder is None else str(config.folder / FILE)
         try:
-            self._db = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
-            for pragma in ("locking_mode = EXCLUSIVE", "journal_mode = WAL"):
-                self._db.execute(f"PRAGMA {pragma}")
-            self._db.executescript(_SCHEMA)
-            for table, columns in _ADDED.items():
-                for column in columns:
-                    with suppress(sqlite3.OperationalError):  # it is there
-                        self._db.execute(f"ALTER TABLE {table} ADD COLUMN {column}")
-            self._db.execute(f"SELECT {_COLUMNS} FROM session LIMIT 0")
-            (state,) = self._db.execute("PRAGMA quick_check(1)").fetchone()
-            if state != "ok":
-                raise sqlite3.DatabaseError(" ".join(state.split()))
+            self._db = _opened(path)
         except sqlite3.Error as error:
             way = "a damaged one must be moved away, with what it holds, or be replaced by a backup"
             rule = f"must be a relay's own, of one relay at a time; {way}"

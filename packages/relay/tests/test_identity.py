@@ -1,6 +1,7 @@
 """Who is at the other end: tokens of a local issuer whose keys change, certificates, TLS."""
 
 import datetime
+import inspect
 import ipaddress
 import ssl
 import threading
@@ -170,7 +171,9 @@ class Authority:
     def __init__(self, folder: Path, name: str) -> None:
         self.folder, self.name = folder, name
         self.key = ec.generate_private_key(ec.SECP256R1())
-        self.certificate = self._signed(name, self.key.public_key(), x509.BasicConstraints(ca=True, path_length=None))
+        signs = dict.fromkeys(inspect.signature(x509.KeyUsage).parameters, False) | {"key_cert_sign": True}
+        constraints = x509.BasicConstraints(ca=True, path_length=None)
+        self.certificate = self._signed(name, self.key.public_key(), constraints, x509.KeyUsage(**signs))
         self.file = folder / f"{name}.pem"
         self.file.write_bytes(self.certificate.public_bytes(serialization.Encoding.PEM))
 
@@ -179,8 +182,12 @@ class Authority:
         mine = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, self.name)])
         now, hour = datetime.datetime.now(datetime.UTC), datetime.timedelta(hours=1)
         builder = x509.CertificateBuilder(mine, subject, public, x509.random_serial_number(), now - hour, now + hour)
-        for extension in extensions:
-            builder = builder.add_extension(extension, critical=False)
+        # Since Python 3.13 clients want what RFC 5280 does: keys' identifiers, critical extensions.
+        own, issuer = x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier
+        identifiers = own.from_public_key(public), issuer.from_issuer_public_key(self.key.public_key())
+        for extension in (*identifiers, *extensions):
+            critical = isinstance(extension, (x509.BasicConstraints, x509.KeyUsage))
+            builder = builder.add_extension(extension, critical=critical)
         return builder.sign(self.key, hashes.SHA256())
 
     def issue(self, name: str, alternative: Any) -> tuple[str, str]:
