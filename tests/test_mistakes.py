@@ -96,6 +96,11 @@ def test_an_argument_by_another_name_is_understood(argument: dict[str, Any], say
         gym.make("bufgym/Uplink-v1", **argument)
 
 
+def test_no_argument_is_meant_that_the_environment_lacks() -> None:
+    with pytest.raises(TypeError, match="'fps'; known: (?!.*rate_hz)"):
+        gym.make("bufgym/Interruption-v1", fps=30)
+
+
 RULE = """
 from bufgym.policies import register
 @register("mine"{})

@@ -138,18 +138,30 @@ class Options:
 
 _NAMES = tuple(field.name for field in fields(Options))
 _OF_BATCHES = ("max_episode_steps", "autoreset_mode")
-_MEANT = {
-    "L": "did you mean 'capacity'?",
-    "buffer_size": "did you mean 'capacity'?",
-    "fps": "did you mean 'rate_hz'?",
-    "seconds": "did you mean 'duration_s'?",
-    "size": "did you mean 'size_bytes'?",
-    "bytes": "did you mean 'size_bytes'?",
+_OTHER_NAMES = {
+    "L": "capacity",
+    "buffer_size": "capacity",
+    "fps": "rate_hz",
+    "seconds": "duration_s",
+    "size": "size_bytes",
+    "bytes": "size_bytes",
+}
+"""What else one may call an argument -> the argument."""
+_ELSEWHERE = {
     "seed": "a seed goes to reset(seed=...)",
     "suite": "bufgym/Suite-v1 takes it",
     "split": "bufgym/Suite-v1 takes it",
 }
-"""What else one may call an argument, or where it goes -> the words that say so."""
+
+
+def _unknown(name: str, known: Sequence[str]) -> str:
+    """Say what was meant by an argument that a scenario and the options do not have, or who takes it."""
+    if name in _OF_BATCHES:
+        return f"a batch takes it; Gymnasium's SyncVectorEnv by vector_kwargs={{{name!r}: ...}}"
+    meant = _OTHER_NAMES.get(name)
+    if name in _ELSEWHERE or meant in known:
+        return f"unknown argument {name!r}; {_ELSEWHERE.get(name) or f'did you mean {meant!r}?'}"
+    return str(unknown("argument", name, known))
 
 
 def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
@@ -161,11 +173,7 @@ def read_arguments(scenario: Any, **arguments: Any) -> tuple[Scenario, Options]:
     known = parameters(spec)
     for name in arguments:
         if name not in known:
-            ours = str(unknown("argument", name, [*known, *_NAMES, *_OF_BATCHES]))
-            if name in _MEANT:
-                ours = f"unknown argument {name!r}; {_MEANT[name]}"
-            if name in _OF_BATCHES:
-                ours = f"a batch takes it; Gymnasium's SyncVectorEnv by vector_kwargs={{{name!r}: ...}}"
+            ours = _unknown(name, [*known, *_NAMES, *_OF_BATCHES])
             raise UnknownArgumentError(
                 f"{type(spec).__name__}.__init__() got an unexpected keyword argument {name!r}: {ours}"
             )

@@ -96,6 +96,12 @@ class Verifier:
             return str(answer.read(MAX_KEYS_BYTES).decode())
 
 
+def check_file(table: str, key: str, path: str) -> None:
+    """Raise a BufgymError if there is no file of a path that a key of the configuration names."""
+    if not Path(path).is_file():
+        raise BufgymError(f"{table}: {key} = {path!r}: no such file")
+
+
 def server_context(tls: Tls) -> ssl.SSLContext:
     """Set up TLS for the relay; clients are asked for certificates if an authority for them is given."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -106,8 +112,8 @@ def server_context(tls: Tls) -> ssl.SSLContext:
 def renew(context: ssl.SSLContext, tls: Tls) -> None:
     """Read the files again, for connections from now on; if they cannot be read, all stays as it is."""
     for key in ("certificate", "key", "clients"):
-        if getattr(tls, key) and not Path(getattr(tls, key)).is_file():
-            raise BufgymError(f"tls: {key} = {getattr(tls, key)!r}: no such file")
+        if path := getattr(tls, key):
+            check_file("tls", key, path)
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(tls.certificate, tls.key)
         context.load_cert_chain(tls.certificate, tls.key)

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from http import HTTPStatus
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from msgspec.structs import replace
@@ -31,7 +30,7 @@ from bufgym_relay.config import POLICIES, Config
 from bufgym_relay.connection import HELLO_BYTES, Connection
 from bufgym_relay.faults import doubts
 from bufgym_relay.hub import CONNECTED, STATUS, Hub
-from bufgym_relay.identity import Verifier, renew, server_context
+from bufgym_relay.identity import Verifier, check_file, renew, server_context
 from bufgym_relay.robofleet import RobofleetConnection
 from bufgym_relay.rules import Identity, Permissions
 from bufgym_robot.wire import messages as wire
@@ -272,8 +271,8 @@ def check(config: Config) -> None:
     _check_policies(config)
     if config.tls is not None:
         server_context(config.tls)
-    if config.tokens is not None and "://" not in config.tokens.keys and not Path(config.tokens.keys).is_file():
-        raise BufgymError(f"tokens: keys = {config.tokens.keys!r}: no such file")
+    if config.tokens is not None and "://" not in config.tokens.keys:
+        check_file("tokens", "keys", config.tokens.keys)
 
 
 async def serve_forever(config: Config, say: Any = print, load: Callable[[], Config] | None = None) -> None:

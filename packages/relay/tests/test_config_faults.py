@@ -1,7 +1,9 @@
 """Faults of a configuration: each answer names file, line, key, value and rule."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from needs import needs
@@ -16,6 +18,15 @@ from bufgym_relay.faults import doubts
 
 ANY_ADDRESS = '[[rules]]\naddress = "10.0.0.1"\n'
 ANY_EMAIL = '[[rules]]\nemail = "a@x.org"\n'
+
+
+def refused(text: str, folder: Path, read: Callable[[str], Any]) -> tuple[str, str]:
+    """The path of a file with this text, and the error that reading it raises."""
+    path = folder / "relay.toml"
+    path.write_text(text)
+    with pytest.raises(BufgymError) as raised:
+        read(str(path))
+    return str(path), str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -69,12 +80,9 @@ ANY_EMAIL = '[[rules]]\nemail = "a@x.org"\n'
     ],
 )
 def test_each_fault_is_named(text: str, error: str, tmp_path: Path) -> None:
-    path = tmp_path / "relay.toml"
-    path.write_text(text)
-    with pytest.raises(BufgymError) as raised:
-        load(path)
-    assert str(raised.value).startswith(f"{path}{error[:1]}" if error[:1] in ",:" else str(path))
-    assert error in str(raised.value) and "`" not in str(raised.value)
+    path, said = refused(text, tmp_path, load)
+    assert said.startswith(f"{path}{error[:1]}" if error[:1] in ",:" else path)
+    assert error in said and "`" not in said
 
 
 @pytest.mark.parametrize(
@@ -86,11 +94,8 @@ def test_each_fault_is_named(text: str, error: str, tmp_path: Path) -> None:
     ],
 )
 def test_check_opens_what_the_file_names(text: str, error: str, tmp_path: Path) -> None:
-    path = tmp_path / "relay.toml"
-    path.write_text(text)
-    with pytest.raises(BufgymError) as raised:
-        asyncio.run(commands.serve(config=str(path), check=True))
-    assert str(raised.value).startswith(f"{path}: ") and error in str(raised.value)
+    path, said = refused(text, tmp_path, lambda path: asyncio.run(commands.serve(config=path, check=True)))
+    assert said.startswith(f"{path}: ") and error in said
 
 
 def test_a_rule_that_does_nothing_is_doubted() -> None:
