@@ -97,8 +97,8 @@ def test_an_argument_by_another_name_is_understood(argument: dict[str, Any], say
 
 
 def test_no_argument_is_meant_that_the_environment_lacks() -> None:
-    with pytest.raises(TypeError, match="'fps'; known: (?!.*rate_hz)"):
-        gym.make("bufgym/Interruption-v1", fps=30)
+    with pytest.raises(TypeError, match=r"'fps'; known: (?!.*rate_hz)"):
+        gym.make("bufgym/Suite-v1", suite="lte-v1", fps=30)
 
 
 RULE = """
